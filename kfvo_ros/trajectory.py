@@ -1,0 +1,166 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Stamped poses, and the TUM and KITTI files that hold them.
+
+A stamp is an int of nanoseconds. Decimal text becomes nanoseconds without a float in between,
+because a float64 of a present-day epoch is only good to 0.2 microseconds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from kfvo_ros import geometry
+from kfvo_ros.errors import KfvoError
+
+NANOSECONDS = 1_000_000_000
+ASSOCIATION_LIMIT_NS = 10_000_000
+"""Ground truth farther than this from a frame is not its ground truth (10 ms)."""
+
+
+def parse_stamp_ns(text: str) -> int:
+    """Return nanoseconds of decimal seconds, exact to the ninth decimal (further ones are cut).
+
+    Exponents, as KITTI's times.txt prints them, are accepted. Raises ValueError.
+    """
+    mantissa, _, exponent = text.strip().lower().partition('e')
+    shift = 9 + (int(exponent) if exponent else 0)
+    whole, _, fraction = mantissa.partition('.')
+    digits = whole.lstrip('+-') + fraction
+    if not digits.isdigit() or not digits.isascii():
+        raise ValueError(f'not a decimal number of seconds: {text!r}')
+    shift -= len(fraction)
+    value = int(digits) * 10 ** shift if shift >= 0 else int(digits) // 10 ** -shift
+    return -value if whole.startswith('-') else value
+
+
+def format_stamp(stamp_ns: int) -> str:
+    """Return seconds with nine decimals, the inverse of `parse_stamp_ns`."""
+    sign = '-' if stamp_ns < 0 else ''
+    seconds, nanoseconds = divmod(abs(int(stamp_ns)), NANOSECONDS)
+    return f'{sign}{seconds}.{nanoseconds:09d}'
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Poses along time.
+
+    ``stamps_ns`` (N,) int64, strictly increasing for odometry, as read for ground truth;
+    ``poses`` (N, 4, 4) float64, T_world_x; ``has_rotation`` is False for point measurements
+    (a prism, a GNSS antenna), whose rotations are identity and mean nothing.
+    """
+
+    stamps_ns: np.ndarray
+    poses: np.ndarray
+    has_rotation: bool = True
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    @property
+    def positions(self) -> np.ndarray:
+        """Positions (N, 3)."""
+        return self.poses[:, :3, 3]
+
+    @property
+    def path_length(self) -> float:
+        """Sum of the distances between consecutive positions."""
+        return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
+
+    def select(self, indices: np.ndarray) -> Trajectory:
+        """Return the poses at `indices`."""
+        return Trajectory(self.stamps_ns[indices], self.poses[indices], self.has_rotation)
+
+    def moved(self, T_x_y: np.ndarray) -> Trajectory:
+        """Return the trajectory of y, rigidly mounted on x: T_world_y = T_world_x T_x_y."""
+        return Trajectory(self.stamps_ns, self.poses @ T_x_y, self.has_rotation)
+
+
+def associate(stamps_ns: np.ndarray, reference_ns: np.ndarray,
+              limit_ns: int = ASSOCIATION_LIMIT_NS) -> tuple[np.ndarray, np.ndarray]:
+    """Match stamps to their nearest reference, one to one and within `limit_ns`.
+
+    Returns index arrays into `stamps_ns` and `reference_ns`, in the order of `stamps_ns`. Of
+    two stamps that want the same reference the nearer one gets it.
+    """
+    stamps_ns, reference_ns = np.asarray(stamps_ns), np.asarray(reference_ns)
+    if len(stamps_ns) == 0 or len(reference_ns) == 0:
+        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+    order = np.argsort(reference_ns, kind='stable')
+    ordered = reference_ns[order]
+    after = np.clip(np.searchsorted(ordered, stamps_ns), 1, max(len(ordered) - 1, 1))
+    after = np.minimum(after, len(ordered) - 1)
+    before = np.maximum(after - 1, 0)
+    nearest = np.where(np.abs(ordered[before] - stamps_ns) <= np.abs(ordered[after] - stamps_ns),
+                       before, after)
+    distance = np.abs(ordered[nearest] - stamps_ns)
+    candidates = np.flatnonzero(distance <= limit_ns)
+    candidates = candidates[np.lexsort((candidates, distance[candidates]))]
+    _, first = np.unique(nearest[candidates], return_index=True)
+    chosen = np.sort(candidates[first])
+    return chosen, order[nearest[chosen]]
+
+
+def format_tum_line(stamp_ns: int, T_world_x: np.ndarray) -> str:
+    """Return ``stamp tx ty tz qx qy qz qw`` and a newline."""
+    quat_xyzw = geometry.quat_xyzw_from_rotation(T_world_x[:3, :3])
+    numbers = ' '.join(f'{value:.9f}' for value in (*T_world_x[:3, 3], *quat_xyzw))
+    return f'{format_stamp(stamp_ns)} {numbers}\n'
+
+
+def read_tum(path: Path) -> Trajectory:
+    """Read a TUM file (``stamp tx ty tz qx qy qz qw`` per line, ``#`` comments), T_world_x.
+
+    Raises KfvoError naming the first line that is not eight numbers.
+    """
+    stamps_ns, rows = [], []
+    for number, line in _data_lines(path):
+        fields = line.replace(',', ' ').split()
+        try:
+            stamps_ns.append(parse_stamp_ns(fields[0]))
+            row = [float(field) for field in fields[1:8]]
+        except ValueError:
+            row = []
+        if len(row) != 7 or not np.isfinite(row).all() or not any(row[3:]):
+            raise KfvoError(f'{path}, line {number}: expected "stamp tx ty tz qx qy qz qw", '
+                            f'found {line[:80]!r}')
+        rows.append(row)
+    values = np.array(rows, dtype=np.float64).reshape(-1, 7)
+    rotations = geometry.rotation_from_quat_xyzw(values[:, 3:])
+    return Trajectory(np.array(stamps_ns, dtype=np.int64),
+                      geometry.make_transform(rotations, values[:, :3]))
+
+
+def read_kitti_poses(path: Path, stamps_ns: np.ndarray) -> Trajectory:
+    """Read a KITTI pose file (12 numbers per frame, the rows of T_world_camera 3x4).
+
+    Raises KfvoError when a line is not 12 numbers or the file is not one pose per stamp.
+    """
+    rows = []
+    for number, line in _data_lines(path):
+        try:
+            row = [float(field) for field in line.split()]
+        except ValueError:
+            row = []
+        if len(row) != 12 or not np.isfinite(row).all():
+            raise KfvoError(f'{path}, line {number}: expected 12 numbers, found {line[:80]!r}')
+        rows.append(row)
+    if len(rows) != len(stamps_ns):
+        raise KfvoError(f'{path} holds {len(rows)} poses for {len(stamps_ns)} frames; '
+                        'expected one line per frame')
+    matrices = np.array(rows, dtype=np.float64).reshape(-1, 3, 4)
+    return Trajectory(np.asarray(stamps_ns, dtype=np.int64),
+                      geometry.make_transform(matrices[:, :, :3], matrices[:, :, 3]))
+
+
+def _data_lines(path: Path) -> list[tuple[int, str]]:
+    """Return (line number, text) of the lines that are neither empty nor comments."""
+    try:
+        text = Path(path).read_text(encoding='utf-8')
+    except (OSError, UnicodeDecodeError) as error:
+        raise KfvoError(f'cannot read {path}: {error}') from error
+    stripped = ((number, line.strip()) for number, line in enumerate(text.splitlines(), 1))
+    return [(number, line) for number, line in stripped if line and not line.startswith('#')]
