@@ -27,6 +27,9 @@ MODEL_SYNONYMS = {'': 'none', 'none': 'none', 'pinhole': 'none', 'plumb_bob': 'p
 UNDISTORT_STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-10)
 """OpenCV's own stop of five iterations leaves 0.3 px in the corners of EuRoC's lens."""
 
+# OpenCV 5 folded the iterative call into the plain one.
+_undistort_points = getattr(cv2, 'undistortPointsIter', None) or cv2.undistortPoints
+
 MAX_VIEW_ANGLE = math.radians(80.0)
 """Rays farther off the axis have no usable pinhole coordinates."""
 
@@ -85,8 +88,8 @@ class Camera:
         if self.distortion_model == 'equidistant':
             points = cv2.fisheye.undistortPoints(pixels, self.matrix, coefficients)
         else:
-            points = cv2.undistortPointsIter(pixels, self.matrix, coefficients, None, None,
-                                             UNDISTORT_STOP)
+            points = _undistort_points(pixels, self.matrix, coefficients, R=None, P=None,
+                                       criteria=UNDISTORT_STOP)
         points = points[:, 0]
         usable = np.isfinite(points).all(axis=1)
         usable &= np.hypot(points[:, 0], points[:, 1]) < math.tan(MAX_VIEW_ANGLE)
