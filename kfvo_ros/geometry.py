@@ -100,6 +100,12 @@ def rotation_from_quat_xyzw(quat_xyzw: np.ndarray) -> np.ndarray:
     return np.eye(3) + 2.0 * scalar * generator + 2.0 * (generator @ generator)
 
 
+def orthonormalise(transform: np.ndarray) -> np.ndarray:
+    """Return T (..., 4, 4) with an exact rotation; products of many drift away from one."""
+    quat_xyzw = quat_xyzw_from_rotation(transform[..., :3, :3])
+    return make_transform(rotation_from_quat_xyzw(quat_xyzw), transform[..., :3, 3])
+
+
 @dataclass(frozen=True)
 class Similarity:
     """x_target = scale * rotation @ x_source + translation."""

@@ -1,0 +1,135 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The contract between a backbone and the odometry: read this to add a model.
+
+A backbone turns a window of frames into poses relative to its first frame, the anchor. It is
+told nothing about keyframe policies, trajectories or scale alignment. One `Backbone` serves
+many `Stream`s; all memory of one sequence lives in its stream, so a reset is a new stream.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
+
+import numpy as np
+
+from kfvo_ros.camera import Camera
+from kfvo_ros.sequences.base import Frame
+from kfvo_ros.tracking import Tracks
+
+
+class Status(str, Enum):
+    """What a backbone says of the newest frame of a window."""
+
+    OK = 'ok'
+    HELD = 'held'
+    """The camera stands still or only turns: rotation is seen, translation is not."""
+    LOST = 'lost'
+    """The frame could not be placed; its pose is a guess."""
+
+
+@dataclass(frozen=True)
+class Encoded:
+    """One frame after `Stream.encode`.
+
+    ``descriptor`` (D,) float32 summarises the image for the keyframe policy. ``payload`` is the
+    backbone's own. ``tracks`` are offered by backbones that track anyway.
+    """
+
+    stamp_ns: int
+    descriptor: np.ndarray
+    payload: Any = None
+    tracks: Tracks | None = None
+
+
+@dataclass(frozen=True)
+class Points:
+    """Scene points by track id: ``positions`` (P, 3) in the anchor, in the estimate's unit.
+
+    ``information`` (P,) is the inverse variance of the logarithm of a point's depth.
+    """
+
+    ids: np.ndarray
+    positions: np.ndarray
+    information: np.ndarray
+
+    @property
+    def depths(self) -> np.ndarray:
+        """Distances (P,) from the anchor's centre."""
+        return np.linalg.norm(self.positions, axis=1)
+
+
+@dataclass(frozen=True)
+class Previous:
+    """What earlier windows said of this one: a hint that a stateless backbone ignores.
+
+    ``T_anchor_frame`` (S - 1, 4, 4) are the keyframes' poses in the present anchor and
+    ``points`` the latest points in it, both in trajectory units. ``T_anchor_latest`` (4, 4) is
+    the pose of the frame before the new one, kept or not. ``memory`` is what the last estimate
+    put there, with ``memory_scale`` = trajectory units per unit of that estimate.
+    """
+
+    T_anchor_frame: np.ndarray
+    T_anchor_latest: np.ndarray
+    points: Points | None
+    memory: Any = None
+    memory_scale: float = 1.0
+
+
+@dataclass(frozen=True)
+class Window:
+    """Keyframes, oldest first, and the new frame last: ``frames`` (S), S >= 2."""
+
+    stream: Stream
+    frames: tuple[Encoded, ...]
+    previous: Previous | None = None
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What a backbone says of one window.
+
+    ``T_anchor_frame`` (S, 4, 4) float64, the first exactly identity, translations in one
+    unit per window; ``covariance`` (S, 6, 6) of each pose in the anchor, translation first,
+    then rotation [rad]; ``points`` or None; ``signals`` (len(signal_names),) float32 for the
+    policy; ``status`` of the newest frame; ``memory`` comes back in the next `Previous`.
+    """
+
+    T_anchor_frame: np.ndarray
+    covariance: np.ndarray
+    points: Points | None
+    signals: np.ndarray
+    status: Status = Status.OK
+    memory: Any = None
+
+
+class Stream(ABC):
+    """All memory of one sequence: tracks, caches."""
+
+    @abstractmethod
+    def encode(self, frame: Frame) -> Encoded:
+        """Take in the next input frame, kept or not, in order; once per frame."""
+
+    def release(self, encoded: Encoded) -> None:
+        """Free what is held for a frame that left the window."""
+
+
+class Backbone(ABC):
+    """A model that places the frames of a window."""
+
+    name: str
+    descriptor_size: int
+    signal_names: tuple[str, ...] = ()
+    default_scale_rule: str = 'translation'
+
+    @abstractmethod
+    def open(self, camera: Camera | None) -> Stream:
+        """Start a sequence; raises KfvoError when the camera does not fit the model."""
+
+    @abstractmethod
+    def estimate(self, windows: Sequence[Window]) -> list[Estimate]:
+        """Place the frames of many windows in one call; no side effects."""

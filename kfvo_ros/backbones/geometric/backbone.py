@@ -1,0 +1,115 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The backbone for any CPU: KLT tracks and windowed bundle adjustment."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from kfvo_ros import geometry
+from kfvo_ros.backbones.base import Backbone, Encoded, Estimate, Previous, Status, Stream, Window
+from kfvo_ros.backbones.geometric.initialisation import Initialiser
+from kfvo_ros.backbones.geometric.observations import View, tabulate
+from kfvo_ros.backbones.geometric.signals import SIGNAL_NAMES, Motion, measure_motion, signals
+from kfvo_ros.backbones.geometric.window import MIN_TRACKS, Solution, solve
+from kfvo_ros.camera import Camera
+from kfvo_ros.errors import KfvoError
+from kfvo_ros.images import to_grey
+from kfvo_ros.sequences.base import Frame
+from kfvo_ros.tracking import Tracker
+
+THUMBNAIL = (8, 6)
+HELD_PARALLAX = 1.0
+"""With less parallax to every keyframe of the window a frame tells nothing of translation [px]."""
+LOST_VARIANCE = 1e2
+"""Variance of each component of a pose that is only a guess."""
+
+
+class GeometricStream(Stream):
+    """Tracks of one sequence."""
+
+    def __init__(self, camera: Camera, seed: int) -> None:
+        self.camera = camera
+        self.initialiser = Initialiser(0.5 * (camera.fx + camera.fy), seed)
+        self._tracker = Tracker(camera, seed=seed)
+        self._count = 0
+
+    def encode(self, frame: Frame) -> Encoded:
+        """Track the frame; the descriptor is an 8x6 thumbnail free of brightness and contrast."""
+        grey = to_grey(frame.image)
+        if grey.shape != (self.camera.height, self.camera.width):
+            raise KfvoError(f'the calibration is for {self.camera.width}x{self.camera.height} '
+                            f'images, {grey.shape[1]}x{grey.shape[0]} came')
+        tracks = self._tracker.track(grey)
+        points = self.camera.undistort(tracks.pixels)
+        usable = np.isfinite(points).all(axis=1)
+        view = View(self._count, tracks.select(usable), points[usable])
+        self._count += 1
+        return Encoded(frame.stamp_ns, _describe(grey), view, tracks)
+
+
+class GeometricBackbone(Backbone):
+    """Needs a calibrated camera; poses come with points, so scale is aligned by depth."""
+
+    name = 'geometric'
+    descriptor_size = THUMBNAIL[0] * THUMBNAIL[1]
+    signal_names = SIGNAL_NAMES
+    default_scale_rule = 'depth'
+
+    def __init__(self, seed: int = 0) -> None:
+        self._seed = seed
+
+    def open(self, camera: Camera | None) -> GeometricStream:
+        """Start a sequence; raises KfvoError without a calibration."""
+        if camera is None:
+            raise KfvoError('the geometric backbone needs a calibrated camera, none came; give '
+                            'a camera_info.yaml')
+        return GeometricStream(camera, self._seed)
+
+    def estimate(self, windows: Sequence[Window]) -> list[Estimate]:
+        """Solve each window."""
+        return [_estimate(window) for window in windows]
+
+
+def _estimate(window: Window) -> Estimate:
+    views = [encoded.payload for encoded in window.frames]
+    previous = window.previous
+    rejected = previous.memory if previous is not None else np.zeros(0, dtype=np.int64)
+    observations = tabulate(views, rejected)
+    if observations.mask[:, -1].sum() < MIN_TRACKS:
+        return _lost(window)
+    solution = solve(observations, window.stream.initialiser, previous)
+    placed = solution.inliers[:, -1].sum() >= MIN_TRACKS
+    if not placed or not np.isfinite(solution.T_anchor_frame).all():
+        return _lost(window)
+    motion = measure_motion(solution, views, window.stream.initialiser.focal)
+    status = Status.HELD if motion.window_parallax < HELD_PARALLAX else Status.OK
+    T_anchor_frame = solution.T_anchor_frame
+    T_anchor_frame[0] = np.eye(4)
+    rejected = np.union1d(rejected[np.isin(rejected, observations.ids)],
+                          observations.ids[~solution.solved])
+    return Estimate(T_anchor_frame, solution.covariance(), solution.points(),
+                    signals(solution, motion), status, rejected)
+
+
+def _lost(window: Window) -> Estimate:
+    """Return the known poses, and the last frame's for the new one."""
+    frames = len(window.frames)
+    T_anchor_frame = np.tile(np.eye(4), (frames, 1, 1))
+    points, memory = None, np.zeros(0, dtype=np.int64)
+    if window.previous is not None:
+        T_anchor_frame[:-1] = window.previous.T_anchor_frame
+        T_anchor_frame[-1] = window.previous.T_anchor_latest
+        points, memory = window.previous.points, window.previous.memory
+    covariance = np.tile(LOST_VARIANCE * np.eye(6), (frames, 1, 1))
+    covariance[0] = 0.0
+    return Estimate(T_anchor_frame, covariance, points,
+                    np.zeros(len(SIGNAL_NAMES), dtype=np.float32), Status.LOST, memory)
+
+
+def _describe(grey: np.ndarray) -> np.ndarray:
+    small = cv2.resize(grey, THUMBNAIL, interpolation=cv2.INTER_AREA).astype(np.float32).ravel()
+    return (small - small.mean()) / (small.std() + 5.0)

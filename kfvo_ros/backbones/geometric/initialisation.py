@@ -1,0 +1,173 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""First guesses for a window: from nothing, or from what the window before it found."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import poselib
+
+from kfvo_ros import geometry
+from kfvo_ros.backbones.base import Previous
+from kfvo_ros.backbones.geometric import kernels
+from kfvo_ros.backbones.geometric.bundle_adjustment import State
+from kfvo_ros.backbones.geometric.observations import Observations
+
+MIN_PAIR_TRACKS = 12
+"""Two frames with fewer common tracks cannot start a window."""
+ENOUGH_TRACKS, ENOUGH_FLOW = 100, 50.0
+"""More common tracks, or more flow [px], do not make a pair better."""
+MIN_RESECTION_POINTS = 6
+NEAREST, FARTHEST = 0.02, 50.0
+"""Triangulated inverse depths are believed within this range of the scene's median."""
+LEAST_INVERSE_DEPTH = 1e-4
+
+RELATIVE_POSE = {'max_epipolar_error': 1.0, 'max_iterations': 500, 'min_iterations': 50}
+ABSOLUTE_POSE = {'max_reproj_error': 3.0, 'max_iterations': 200, 'min_iterations': 20}
+
+
+class Initialiser:
+    """Minimal solvers on undistorted pixels: `focal` [px] times normalised coordinates."""
+
+    def __init__(self, focal: float, seed: int) -> None:
+        self.focal = focal
+        self._seed = seed
+        self._camera = {'model': 'SIMPLE_PINHOLE', 'width': 1, 'height': 1,
+                        'params': [focal, 0.0, 0.0]}
+
+    def from_nothing(self, observations: Observations) -> State:
+        """Return poses and depths of a window of which nothing is known, baseline 1.
+
+        The pair of frames with most tracks and flow gives the first two poses, the others are
+        resected one by one from the points triangulated so far.
+        """
+        frames = observations.mask.shape[1]
+        T_first_frame = np.tile(np.eye(4), (frames, 1, 1))
+        pair = self._best_pair(observations)
+        if pair is None:
+            return State(T_first_frame[:, :3, :3], T_first_frame[:, :3, 3],
+                         np.ones(len(observations)))
+        first, second = pair
+        T_first_frame[second] = self._relative_pose(observations, first, second)
+        placed = np.zeros(frames, dtype=bool)
+        placed[[first, second]] = True
+        remaining = [frame for frame in range(frames) if not placed[frame]]
+        for frame in sorted(remaining, key=lambda f: min(abs(f - first), abs(f - second))):
+            nearest = min(np.flatnonzero(placed), key=lambda other: abs(other - frame))
+            T_first_frame[frame] = self._resect_in_turn(
+                observations, T_first_frame, placed, frame, T_first_frame[nearest])
+            placed[frame] = True
+        T_anchor_frame = geometry.relative(T_first_frame[0], T_first_frame)
+        return complete(observations, T_anchor_frame, np.full(len(observations), np.nan))
+
+    def from_previous(self, observations: Observations, previous: Previous) -> State:
+        """Return the poses and depths known from earlier windows, and the new frame resected."""
+        T_anchor_frame = np.concatenate([previous.T_anchor_frame, previous.T_anchor_latest[None]])
+        inverse_depths = known_inverse_depths(observations, T_anchor_frame, previous)
+        visible = np.isfinite(inverse_depths) & observations.mask[:, -1]
+        T_anchor_frame[-1] = self._resect(observations, T_anchor_frame, inverse_depths, visible,
+                                          len(T_anchor_frame) - 1, previous.T_anchor_latest)
+        return complete(observations, T_anchor_frame, inverse_depths)
+
+    def _best_pair(self, observations: Observations) -> tuple[int, int] | None:
+        """Return the two frames whose relative pose is best determined."""
+        best, pair = 0.0, None
+        frames = observations.mask.shape[1]
+        for i in range(frames):
+            for j in range(i + 1, frames):
+                both = observations.mask[:, i] & observations.mask[:, j]
+                if both.sum() < MIN_PAIR_TRACKS:
+                    continue
+                shift = observations.seen[both, i] - observations.seen[both, j]
+                flow = self.focal * float(np.median(np.linalg.norm(shift, axis=1)))
+                score = min(both.sum(), ENOUGH_TRACKS) * (min(flow, ENOUGH_FLOW) + 1e-3)
+                if score > best:
+                    best, pair = score, (i, j)
+        return pair
+
+    def _relative_pose(self, observations: Observations, i: int, j: int) -> np.ndarray:
+        """Return T_i_j with a translation of length 1."""
+        both = observations.mask[:, i] & observations.mask[:, j]
+        pose, _ = poselib.estimate_relative_pose(
+            self.focal * observations.seen[both, i], self.focal * observations.seen[both, j],
+            self._camera, self._camera, RELATIVE_POSE | {'seed': self._seed}, {})
+        T_i_j = _inverse_of(pose)
+        length = np.linalg.norm(T_i_j[:3, 3])
+        T_i_j[:3, 3] /= length if length > 0.0 else 1.0
+        return T_i_j
+
+    def _resect_in_turn(self, observations: Observations, T_w_frame: np.ndarray,
+                        placed: np.ndarray, frame: int, fallback: np.ndarray) -> np.ndarray:
+        """Return T_w_frame of one more frame from points that two placed frames see."""
+        mask = observations.mask & placed
+        rows = np.flatnonzero((mask.sum(axis=1) >= 2) & observations.mask[:, frame])
+        if len(rows) < MIN_RESECTION_POINTS:
+            return fallback
+        hosts = mask[rows].argmax(axis=1)
+        rays = np.ones((len(rows), 3))
+        rays[:, :2] = observations.seen[rows, hosts]
+        part = Observations(observations.ids[rows], observations.seen[rows], mask[rows], hosts,
+                            rays)
+        inverse_depths, _ = _triangulate(part, T_w_frame)
+        return self._resect(part, T_w_frame, inverse_depths,
+                            inverse_depths > LEAST_INVERSE_DEPTH, frame, fallback)
+
+    def _resect(self, observations: Observations, T_w_frame: np.ndarray,
+                inverse_depths: np.ndarray, usable: np.ndarray, frame: int,
+                fallback: np.ndarray) -> np.ndarray:
+        """Return T_w_frame of `frame` from points of known depth."""
+        if usable.sum() < MIN_RESECTION_POINTS:
+            return fallback
+        T_w_host = T_w_frame[observations.hosts[usable]]
+        positions = np.einsum('pij,pj->pi', T_w_host[:, :3, :3], observations.rays[usable]
+                              / inverse_depths[usable, None]) + T_w_host[:, :3, 3]
+        pose, info = poselib.estimate_absolute_pose(
+            self.focal * observations.seen[usable, frame], positions, self._camera,
+            ABSOLUTE_POSE | {'seed': self._seed}, {})
+        if info['num_inliers'] < MIN_RESECTION_POINTS:
+            return fallback
+        return _inverse_of(pose)
+
+
+def known_inverse_depths(observations: Observations, T_anchor_frame: np.ndarray,
+                         previous: Previous) -> np.ndarray:
+    """Return inverse depths (P,) in the hosts of points known before, NaN for new ones."""
+    inverse_depths = np.full(len(observations), np.nan)
+    if previous.points is None:
+        return inverse_depths
+    _, rows, known = np.intersect1d(observations.ids, previous.points.ids, assume_unique=True,
+                                    return_indices=True)
+    T_anchor_host = T_anchor_frame[observations.hosts[rows]]
+    towards = previous.points.positions[known] - T_anchor_host[:, :3, 3]
+    depths = np.einsum('pi,pi->p', T_anchor_host[:, :3, 2], towards)
+    in_front = depths > kernels.MIN_DEPTH
+    inverse_depths[rows[in_front]] = 1.0 / depths[in_front]
+    return inverse_depths
+
+
+def complete(observations: Observations, T_anchor_frame: np.ndarray,
+             inverse_depths: np.ndarray) -> State:
+    """Return the state with unknown (NaN) inverse depths triangulated, or the median's."""
+    unknown = ~np.isfinite(inverse_depths)
+    triangulated, weights = _triangulate(observations, T_anchor_frame)
+    believed = (triangulated > LEAST_INVERSE_DEPTH) & (weights > 1e-10)
+    reference = inverse_depths[~unknown] if not unknown.all() else triangulated[believed]
+    median = float(np.median(reference)) if len(reference) else 1.0
+    believed &= (triangulated > NEAREST * median) & (triangulated < FARTHEST * median)
+    filled = np.where(unknown, np.where(believed, triangulated, median), inverse_depths)
+    return State(T_anchor_frame[:, :3, :3].copy(), T_anchor_frame[:, :3, 3].copy(), filled)
+
+
+def _triangulate(observations: Observations,
+                 T_anchor_frame: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return kernels.triangulate(
+        np.ascontiguousarray(T_anchor_frame[:, :3, :3]),
+        np.ascontiguousarray(T_anchor_frame[:, :3, 3]), observations.hosts, observations.rays,
+        observations.seen, observations.mask)
+
+
+def _inverse_of(pose: Any) -> np.ndarray:
+    """Return T_a_b (4, 4) of poselib's pose, which maps a to b."""
+    return geometry.invert(geometry.make_transform(pose.R, pose.t))

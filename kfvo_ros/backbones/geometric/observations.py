@@ -1,0 +1,61 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Who sees what in a window: tracks as a table of points by frames."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from kfvo_ros.tracking import Tracks
+
+
+@dataclass(frozen=True)
+class View:
+    """What one frame sees: ``tracks`` in pixels, and where they lie undistorted.
+
+    ``points`` (N, 2) are normalised, undistorted coordinates of the same tracks; ``index``
+    counts the input frames of the stream.
+    """
+
+    index: int
+    tracks: Tracks
+    points: np.ndarray
+
+
+@dataclass(frozen=True)
+class Observations:
+    """The tracks that at least two of F frames see.
+
+    ``ids`` (P,) increasing; ``seen`` (P, F, 2) normalised coordinates under ``mask`` (P, F);
+    ``hosts`` (P,) the first frame that sees a point and ``rays`` (P, 3) its ray there.
+    """
+
+    ids: np.ndarray
+    seen: np.ndarray
+    mask: np.ndarray
+    hosts: np.ndarray
+    rays: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+
+def tabulate(views: Sequence[View], ignored: np.ndarray) -> Observations:
+    """Gather the tracks of `views`, oldest first, without the `ignored` ids."""
+    ids, counts = np.unique(np.concatenate([view.tracks.ids for view in views]),
+                            return_counts=True)
+    ids = ids[(counts >= 2) & ~np.isin(ids, ignored)]
+    seen = np.zeros((len(ids), len(views), 2))
+    mask = np.zeros((len(ids), len(views)), dtype=bool)
+    for frame, view in enumerate(views):
+        _, rows, columns = np.intersect1d(ids, view.tracks.ids, assume_unique=True,
+                                          return_indices=True)
+        seen[rows, frame] = view.points[columns]
+        mask[rows, frame] = True
+    hosts = mask.argmax(axis=1) if len(ids) else np.zeros(0, dtype=np.int64)
+    rays = np.ones((len(ids), 3))
+    rays[:, :2] = seen[np.arange(len(ids)), hosts]
+    return Observations(ids, seen, mask, hosts, rays)

@@ -1,0 +1,73 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What a solved window tells a keyframe policy."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from kfvo_ros import geometry
+from kfvo_ros.backbones.geometric.observations import View
+from kfvo_ros.backbones.geometric.window import Solution
+
+SIGNAL_NAMES = ('track_survival', 'flow', 'parallax', 'gap', 'baseline_to_depth', 'rotation',
+                'inlier_share', 'depth_information')
+
+
+@dataclass(frozen=True)
+class Motion:
+    """How the newest frame moved against the last keyframe, and against the whole window.
+
+    ``survival`` share of the keyframe's tracks still seen; ``flow`` and ``parallax`` (flow
+    after the rotation is taken out), medians [px]; ``window_parallax`` the largest such median
+    against any frame of the window [px]; ``gap`` [input frames].
+    """
+
+    survival: float
+    flow: float
+    parallax: float
+    window_parallax: float
+    gap: int
+
+
+def measure_motion(solution: Solution, views: Sequence[View], focal: float) -> Motion:
+    """Compare the newest frame with the others."""
+    keyframe, newest = views[-2], views[-1]
+    shared = np.isin(keyframe.tracks.ids, newest.tracks.ids, assume_unique=True).sum()
+    last = len(views) - 1
+    parallaxes = [_median_shift(solution, frame, last, focal, True) for frame in range(last)]
+    return Motion(float(shared) / max(len(keyframe.tracks), 1),
+                  _median_shift(solution, last - 1, last, focal, False), parallaxes[-1],
+                  max(parallaxes), newest.index - keyframe.index)
+
+
+def signals(solution: Solution, motion: Motion) -> np.ndarray:
+    """Return (len(SIGNAL_NAMES),) float32; pixels, rotation [rad] and information as log(1 + x)."""
+    poses = solution.T_anchor_frame
+    T_keyframe_newest = geometry.relative(poses[-2], poses[-1])
+    points = solution.points()
+    depth = float(np.median(points.depths)) if len(points.ids) else 1.0
+    newest = solution.observations.mask[:, -1]
+    return np.array([
+        motion.survival, np.log1p(motion.flow), np.log1p(motion.parallax), motion.gap,
+        np.linalg.norm(T_keyframe_newest[:3, 3]) / max(depth, 1e-9),
+        geometry.rotation_angle(T_keyframe_newest[:3, :3]),
+        solution.inliers[newest, -1].mean() if newest.any() else 0.0,
+        np.log1p(np.median(points.information)) if len(points.ids) else 0.0], dtype=np.float32)
+
+
+def _median_shift(solution: Solution, a: int, b: int, focal: float, derotated: bool) -> float:
+    """Return the median image motion from frame a to b [px], zero without common tracks."""
+    observations = solution.observations
+    both = observations.mask[:, a] & observations.mask[:, b]
+    if not both.any():
+        return 0.0
+    before = observations.seen[both, a]
+    if derotated:
+        R_b_a = solution.state.rotations[b].T @ solution.state.rotations[a]
+        turned = np.column_stack([before, np.ones(len(before))]) @ R_b_a.T
+        before = turned[:, :2] / np.maximum(turned[:, 2:], 0.1)
+    return focal * float(np.median(np.linalg.norm(observations.seen[both, b] - before, axis=1)))

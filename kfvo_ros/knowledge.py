@@ -1,0 +1,62 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What one window leaves to the next: poses and points, in the world."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+
+from kfvo_ros import geometry
+from kfvo_ros.backbones.base import Points, Previous
+
+
+class Posed(Protocol):
+    """Anything with a pose."""
+
+    T_world_camera: np.ndarray
+
+
+@dataclass(frozen=True)
+class Knowledge:
+    """The latest frame's pose, the latest points in the world, and the backbone's memory."""
+
+    T_world_latest: np.ndarray = field(default_factory=lambda: np.eye(4))
+    points: Points | None = None
+    memory: Any = None
+    memory_scale: float = 1.0
+
+    def seen_from(self, keyframes: Sequence[Posed]) -> Previous | None:
+        """Return the hint for a window that starts with `keyframes`; None before any estimate."""
+        if self.memory is None and self.points is None:
+            return None
+        T_anchor_world = geometry.invert(keyframes[0].T_world_camera)
+        T_anchor_frame = T_anchor_world @ np.stack([k.T_world_camera for k in keyframes])
+        T_anchor_frame[0] = np.eye(4)
+        return Previous(T_anchor_frame, T_anchor_world @ self.T_world_latest,
+                        moved(self.points, T_anchor_world, 1.0), self.memory, self.memory_scale)
+
+
+def scaled(poses: np.ndarray, scale: float) -> np.ndarray:
+    """Return poses (N, 4, 4) in another unit."""
+    result = poses.copy()
+    result[:, :3, 3] *= scale
+    return result
+
+
+def moved(points: Points | None, T_b_a: np.ndarray, scale: float) -> Points | None:
+    """Return points of frame a, in another unit, in frame b."""
+    if points is None:
+        return None
+    positions = scale * points.positions @ T_b_a[:3, :3].T + T_b_a[:3, 3]
+    return Points(points.ids, positions, points.information)
+
+
+def turned(covariance: np.ndarray, T_b_a: np.ndarray, scale: float) -> np.ndarray:
+    """Return a covariance (6, 6) of frame a, in another unit, in the axes of frame b."""
+    rotation = np.kron(np.eye(2), T_b_a[:3, :3])
+    unit = np.repeat([scale, 1.0], 3)
+    return rotation @ (covariance * np.outer(unit, unit)) @ rotation.T

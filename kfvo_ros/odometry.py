@@ -1,0 +1,217 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Keyframe-based feed-forward visual odometry: the method, one step after the other."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from kfvo_ros import geometry
+from kfvo_ros.backbones.base import Backbone, Encoded, Estimate, Status, Stream, Window
+from kfvo_ros.images import to_grey
+from kfvo_ros.keyframes.base import DecisionInput, KeyframePolicy
+from kfvo_ros.keyframes.observation import observe
+from kfvo_ros.knowledge import Knowledge, moved, scaled, turned
+from kfvo_ros.scale import ScaleAligner
+from kfvo_ros.sequences.base import Frame
+from kfvo_ros.stopwatch import Stopwatch
+from kfvo_ros.tracking import Tracker, Tracks
+
+WINDOW_SIZE = 8
+MAX_LOST_FRAMES = 5
+"""After so many lost frames in a row the window starts anew where the camera was last seen."""
+
+
+@dataclass
+class Keyframe:
+    """A frame in the window; its pose T_world_camera is overwritten by every window it is in."""
+
+    encoded: Encoded
+    tracks: Tracks | None
+    index: int
+    T_world_camera: np.ndarray
+
+
+@dataclass(frozen=True)
+class Placed:
+    """An input frame: where it is, told from the keyframe it hangs on.
+
+    The pose follows the keyframe's refinement and is final when the keyframe leaves the window.
+    """
+
+    stamp_ns: int
+    keyframe: Keyframe
+    T_keyframe_camera: np.ndarray
+    is_keyframe: bool
+
+    @property
+    def T_world_camera(self) -> np.ndarray:
+        """Return the latest pose (4, 4) in trajectory units."""
+        return self.keyframe.T_world_camera @ self.T_keyframe_camera
+
+
+@dataclass(frozen=True)
+class Update:
+    """What one input frame changed.
+
+    ``T_world_camera`` (4, 4) is the estimate at arrival, ``covariance`` (6, 6) its covariance
+    in the world, translation first; ``final`` are the frames whose poses became final, in
+    input order; ``median_depth`` of the window's points [trajectory units], None without
+    points; ``durations`` [s] of the steps encode, estimate, decide.
+    """
+
+    stamp_ns: int
+    T_world_camera: np.ndarray
+    covariance: np.ndarray
+    status: Status
+    is_keyframe: bool
+    final: tuple[Placed, ...]
+    median_depth: float | None
+    durations: dict[str, float]
+
+
+class KeyframeOdometry:
+    """Feed frames in order, get poses: `process` is the method, `finish` ends the sequence.
+
+    `scale_rule` None takes the backbone's own. A caller that batches many sequences into one
+    backbone call runs the steps of `process` itself: `begin`, `integrate`, `commit`.
+    """
+
+    def __init__(self, backbone: Backbone, policy: KeyframePolicy,
+                 scale_rule: str | None = None, window_size: int = WINDOW_SIZE) -> None:
+        self.backbone = backbone
+        self.policy = policy
+        self.window_size = window_size
+        self.scale = ScaleAligner(scale_rule or backbone.default_scale_rule)
+        self._stream: Stream | None = None
+        self._tracker: Tracker | None = None
+        self._keyframes: list[Keyframe] = []
+        self._pending: list[Placed] = []
+        self._known = Knowledge()
+        self._lost_in_a_row = 0
+        self._frames_seen = 0
+
+    def process(self, frame: Frame) -> Update:
+        """Take in the next frame and return what it changed."""
+        clock = Stopwatch()
+        with clock('encode'):
+            window = self.begin(frame)
+        with clock('estimate'):
+            estimate = self.backbone.estimate([window])[0] if window is not None else None
+            decision = self.integrate(estimate)
+        with clock('decide'):
+            keep = decision if isinstance(decision, bool) else self.policy.decide(decision)
+        return self.commit(keep, clock.durations)
+
+    def begin(self, frame: Frame) -> Window | None:
+        """Encode the frame (step 1); return its window, None when there is nothing before it."""
+        if self._stream is None:
+            self._stream = self.backbone.open(frame.camera)
+        encoded = self._stream.encode(frame)
+        self._newest = Keyframe(encoded, self._track(frame, encoded), self._frames_seen,
+                                self._known.T_world_latest)
+        self._frames_seen += 1
+        if self._lost_in_a_row >= MAX_LOST_FRAMES:
+            self._start_anew()
+        if not self._keyframes:
+            return None
+        self._previous = self._known.seen_from(self._keyframes)
+        return Window(self._stream, tuple(k.encoded for k in (*self._keyframes, self._newest)),
+                      self._previous)
+
+    def integrate(self, estimate: Estimate | None) -> DecisionInput | bool:
+        """Align, chain and observe (steps 3 to 5); return the decision's input, or the decision.
+
+        There is nothing to decide while the window fills (keep) or for a lost frame (drop).
+        """
+        if estimate is None:
+            self._known = Knowledge(self._newest.T_world_camera)
+            self._status, self._covariance = Status.OK, np.zeros((6, 6))
+            return True
+        scale = 1.0
+        if estimate.status is not Status.LOST:
+            scale = self.scale.align(estimate, self._previous)
+            self._chain(scaled(estimate.T_anchor_frame, scale))
+        self._lost_in_a_row = self._lost_in_a_row + 1 if estimate.status is Status.LOST else 0
+        T_world_anchor = self._keyframes[0].T_world_camera
+        self._status = estimate.status
+        self._covariance = turned(estimate.covariance[-1], T_world_anchor, scale)
+        self._known = Knowledge(self._newest.T_world_camera,
+                                moved(estimate.points, T_world_anchor, scale), estimate.memory,
+                                scale)
+        if estimate.status is Status.LOST or len(self._keyframes) < self.window_size - 1:
+            return estimate.status is not Status.LOST
+        return self._decision(estimate)
+
+    def commit(self, keep: bool, durations: dict[str, float]) -> Update:
+        """Keep or drop the newest frame (step 6) and return what it changed."""
+        newest, final = self._newest, ()
+        if keep:
+            if len(self._keyframes) == self.window_size - 1:
+                final = self._retire(self._keyframes.pop(0))
+            self._keyframes.append(newest)
+            placed = Placed(newest.encoded.stamp_ns, newest, np.eye(4), True)
+        else:
+            last = self._keyframes[-1]
+            placed = Placed(newest.encoded.stamp_ns, last,
+                            geometry.relative(last.T_world_camera, newest.T_world_camera), False)
+            self._stream.release(newest.encoded)
+        self._pending.append(placed)
+        points = self._known.points
+        depth = None if points is None or not len(points.ids) else float(np.median(
+            np.linalg.norm(points.positions - newest.T_world_camera[:3, 3], axis=1)))
+        return Update(newest.encoded.stamp_ns, newest.T_world_camera, self._covariance,
+                      self._status, keep, final, depth, durations)
+
+    def finish(self) -> tuple[Placed, ...]:
+        """Return the frames whose poses were not final yet; they are now."""
+        final = tuple(self._pending)
+        self._pending.clear()
+        return final
+
+    @property
+    def pending(self) -> tuple[Placed, ...]:
+        """Frames whose poses may still change, in input order."""
+        return tuple(self._pending)
+
+    def _track(self, frame: Frame, encoded: Encoded) -> Tracks | None:
+        """Return the backbone's tracks, or our own where only the policy asks for them."""
+        if encoded.tracks is not None or not self.policy.needs_tracks:
+            return encoded.tracks
+        if self._tracker is None:
+            self._tracker = Tracker(frame.camera)
+        return self._tracker.track(to_grey(frame.image))
+
+    def _chain(self, T_anchor_frame: np.ndarray) -> None:
+        """Step 4: overwrite the poses of all frames in the window but the anchor's."""
+        poses = geometry.orthonormalise(self._keyframes[0].T_world_camera @ T_anchor_frame)
+        for keyframe, pose in zip((*self._keyframes[1:], self._newest), poses[1:], strict=True):
+            keyframe.T_world_camera = pose
+
+    def _decision(self, estimate: Estimate) -> DecisionInput:
+        """Step 5: what the policy sees."""
+        frames = (*self._keyframes, self._newest)
+        last = self._keyframes[-1]
+        observation = observe([frame.encoded.descriptor for frame in frames],
+                              np.stack([frame.T_world_camera for frame in frames]),
+                              estimate.signals)
+        return DecisionInput(observation, last.tracks, self._newest.tracks,
+                             self._newest.index - last.index)
+
+    def _retire(self, keyframe: Keyframe) -> tuple[Placed, ...]:
+        """Let a keyframe leave the window; return the frames that hang on it, final now."""
+        self._stream.release(keyframe.encoded)
+        count = 0
+        while count < len(self._pending) and self._pending[count].keyframe is keyframe:
+            count += 1
+        final, self._pending = tuple(self._pending[:count]), self._pending[count:]
+        return final
+
+    def _start_anew(self) -> None:
+        """Empty the window: the next frame starts another one where the camera was last seen."""
+        self._lost_in_a_row = 0
+        for keyframe in self._keyframes:
+            self._stream.release(keyframe.encoded)
+        self._keyframes.clear()
