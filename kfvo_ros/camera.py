@@ -24,11 +24,8 @@ MODEL_SYNONYMS = {'': 'none', 'none': 'none', 'pinhole': 'none', 'plumb_bob': 'p
                   'rational_polynomial': 'rational_polynomial', 'equidistant': 'equidistant',
                   'fisheye': 'equidistant'}
 
-UNDISTORT_STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-10)
-"""OpenCV's own stop of five iterations leaves 0.3 px in the corners of EuRoC's lens."""
-
-# OpenCV 5 folded the iterative call into the plain one.
-_undistort_points = getattr(cv2, 'undistortPointsIter', None) or cv2.undistortPoints
+NEWTON_STEPS = 15
+"""An ordinary lens takes four, the corners of a wide one eight."""
 
 MAX_VIEW_ANGLE = math.radians(80.0)
 """Rays farther off the axis have no usable pinhole coordinates."""
@@ -58,7 +55,7 @@ class Camera:
             raise KfvoError(f'unknown distortion model {self.distortion_model!r}; expected one '
                             f'of {", ".join(sorted(DISTORTION_SIZES))}')
         coefficients = tuple(float(value) for value in self.distortion)
-        if model == 'none' or not any(coefficients):
+        if model != 'equidistant' and not any(coefficients):
             model, coefficients = 'none', ()
         if len(coefficients) not in DISTORTION_SIZES[model]:
             raise KfvoError(f'{model} takes {DISTORTION_SIZES[model]} distortion coefficients, '
@@ -86,17 +83,38 @@ class Camera:
             return (pixels[:, 0] - (self.cx, self.cy)) / (self.fx, self.fy)
         coefficients = np.array(self.distortion)
         if self.distortion_model == 'equidistant':
-            points = cv2.fisheye.undistortPoints(pixels, self.matrix, coefficients)
+            points = cv2.fisheye.undistortPoints(pixels, self.matrix, coefficients)[:, 0]
         else:
-            points = _undistort_points(pixels, self.matrix, coefficients, R=None, P=None,
-                                       criteria=UNDISTORT_STOP)
-        points = points[:, 0]
+            points = self._undistort_polynomial(pixels[:, 0])
         usable = np.isfinite(points).all(axis=1)
         usable &= np.hypot(points[:, 0], points[:, 1]) < math.tan(MAX_VIEW_ANGLE)
-        # A polynomial past its turning point maps two rays to one pixel: take the way back.
         back = self.distort(np.where(usable[:, None], points, 0.0))
-        usable &= np.linalg.norm(back - pixels[:, 0], axis=1) < 0.5
+        usable &= np.linalg.norm(back - pixels[:, 0], axis=1) < 1e-3
         return np.where(usable[:, None], points, np.nan)
+
+    def _undistort_polynomial(self, pixels: np.ndarray) -> np.ndarray:
+        """Return normalised coordinates (N, 2) of pixels (N, 2) by Newton's method.
+
+        OpenCV's fixed-point iteration stops far from the answer, or goes astray, off the axis
+        of a wide lens. Past the turning point of the polynomial, where two rays meet in one
+        pixel, the answer is NaN.
+        """
+        points, zero = (pixels - (self.cx, self.cy)) / (self.fx, self.fy), np.zeros(3)
+        with np.errstate(all='ignore'):
+            for _ in range(NEWTON_STEPS):
+                rays = np.column_stack([points, np.ones(len(points))])
+                seen, jacobian = cv2.projectPoints(rays, zero, zero, self.matrix,
+                                                   np.array(self.distortion))
+                # At depth 1 the derivative by the camera's shift is that by the point.
+                (a, b), (c, d) = np.moveaxis(jacobian.reshape(-1, 2, jacobian.shape[1]), 0,
+                                             -1)[:, 3:5]
+                u, v = (pixels - seen[:, 0]).T
+                determinant = a * d - b * c
+                step = np.column_stack([d * u - b * v, a * v - c * u]) / determinant[:, None]
+                points = points + step
+                if not np.any(np.abs(step) > 1e-13):
+                    break
+        return np.where(determinant[:, None] > 0.0, points, np.nan)
 
     def distort(self, points: np.ndarray) -> np.ndarray:
         """Return the pixels (N, 2) where normalised coordinates (N, 2) are seen."""
@@ -140,14 +158,15 @@ def read_camera_info(path: Path) -> Camera:
     """
     try:
         document = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise KfvoError(f'cannot read the calibration {path}: {error}') from error
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError) as error:
+        problem = ' '.join(str(error).split())
+        raise KfvoError(f'cannot read the calibration {path}: {problem}') from error
     try:
         fx, _, cx, _, fy, cy = _matrix(document, 'camera_matrix', 9)[:6]
         return Camera(int(document['image_width']), int(document['image_height']), fx, fy, cx,
                       cy, str(document.get('distortion_model', 'none')),
                       _matrix(document, 'distortion_coefficients', None))
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise KfvoError(f'{path}: expected a ROS camera calibration with image_width, '
                         f'image_height, camera_matrix, distortion_model and '
                         f'distortion_coefficients; problem: {error!r}') from error

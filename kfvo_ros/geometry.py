@@ -127,11 +127,13 @@ class Similarity:
 def umeyama(source: np.ndarray, target: np.ndarray, with_scale: bool = True) -> Similarity:
     """Return the least-squares similarity from source to target points, both (N, 3), N >= 1.
 
-    Coincident source points give scale 1 and a pure translation where nothing else is
-    determined. Source: Umeyama, "Least-squares estimation of transformation parameters between
-    two point patterns", PAMI 1991.
+    Coincident source points determine a translation and nothing else. Source: Umeyama,
+    "Least-squares estimation of transformation parameters between two point patterns", PAMI
+    1991.
     """
     mean_source, mean_target = source.mean(axis=0), target.mean(axis=0)
+    if not np.ptp(source, axis=0).any():
+        return Similarity(1.0, np.eye(3), mean_target - mean_source)
     centred_source, centred_target = source - mean_source, target - mean_target
     variance = np.mean(np.sum(centred_source ** 2, axis=1))
     u, singular, vt = np.linalg.svd(centred_target.T @ centred_source / len(source))

@@ -8,6 +8,7 @@ because a float64 of a present-day epoch is only good to 0.2 microseconds.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,21 +21,24 @@ NANOSECONDS = 1_000_000_000
 ASSOCIATION_LIMIT_NS = 10_000_000
 """Ground truth farther than this from a frame is not its ground truth (10 ms)."""
 
+_DECIMAL = re.compile(r'([+-]?)([0-9]*)\.?([0-9]*)(?:[eE]([+-]?[0-9]{1,3}))?')
+
 
 def parse_stamp_ns(text: str) -> int:
     """Return nanoseconds of decimal seconds, exact to the ninth decimal (further ones are cut).
 
-    Exponents, as KITTI's times.txt prints them, are accepted. Raises ValueError.
+    Exponents, as KITTI's times.txt prints them, are accepted. Raises ValueError, also for
+    what 64 bits of nanoseconds (292 years) cannot hold.
     """
-    mantissa, _, exponent = text.strip().lower().partition('e')
-    shift = 9 + (int(exponent) if exponent else 0)
-    whole, _, fraction = mantissa.partition('.')
-    digits = whole.lstrip('+-') + fraction
-    if not digits.isdigit() or not digits.isascii():
+    found = _DECIMAL.fullmatch(text.strip())
+    if found is None or not found[2] + found[3]:
         raise ValueError(f'not a decimal number of seconds: {text!r}')
-    shift -= len(fraction)
-    value = int(digits) * 10 ** shift if shift >= 0 else int(digits) // 10 ** -shift
-    return -value if whole.startswith('-') else value
+    sign, whole, fraction, exponent = found.groups()
+    digits, shift = int(whole + fraction), 9 + int(exponent or 0) - len(fraction)
+    value = digits * 10 ** shift if shift >= 0 else digits // 10 ** -shift
+    if value >= 2 ** 63:
+        raise ValueError(f'not a time of this epoch: {text!r}')
+    return -value if sign == '-' else value
 
 
 def format_stamp(stamp_ns: int) -> str:
@@ -118,13 +122,13 @@ def read_tum(path: Path) -> Trajectory:
     """
     stamps_ns, rows = [], []
     for number, line in _data_lines(path):
-        fields = line.replace(',', ' ').split()
         try:
-            stamps_ns.append(parse_stamp_ns(fields[0]))
-            row = [float(field) for field in fields[1:8]]
+            stamp, *fields = line.replace(',', ' ').split()
+            stamps_ns.append(parse_stamp_ns(stamp))
+            row = [float(field) for field in fields]
         except ValueError:
             row = []
-        if len(row) != 7 or not np.isfinite(row).all() or not any(row[3:]):
+        if len(row) != 7 or not np.isfinite(row).all() or np.linalg.norm(row[3:]) < 1e-3:
             raise KfvoError(f'{path}, line {number}: expected "stamp tx ty tz qx qy qz qw", '
                             f'found {line[:80]!r}')
         rows.append(row)
@@ -137,7 +141,9 @@ def read_tum(path: Path) -> Trajectory:
 def read_kitti_poses(path: Path, stamps_ns: np.ndarray) -> Trajectory:
     """Read a KITTI pose file (12 numbers per frame, the rows of T_world_camera 3x4).
 
-    Raises KfvoError when a line is not 12 numbers or the file is not one pose per stamp.
+    The few digits of the file leave rotations that are none by 1e-7; they are made exact.
+    Raises KfvoError when a line is not 12 numbers with a rotation in them, or the file is not
+    one pose per stamp.
     """
     rows = []
     for number, line in _data_lines(path):
@@ -152,8 +158,13 @@ def read_kitti_poses(path: Path, stamps_ns: np.ndarray) -> Trajectory:
         raise KfvoError(f'{path} holds {len(rows)} poses for {len(stamps_ns)} frames; '
                         'expected one line per frame')
     matrices = np.array(rows, dtype=np.float64).reshape(-1, 3, 4)
-    return Trajectory(np.asarray(stamps_ns, dtype=np.int64),
-                      geometry.make_transform(matrices[:, :, :3], matrices[:, :, 3]))
+    given = geometry.make_transform(matrices[:, :, :3], matrices[:, :, 3])
+    poses = geometry.orthonormalise(given)
+    wrong = np.flatnonzero(np.abs(poses - given).max(axis=(1, 2)) > 1e-2)
+    if len(wrong):
+        raise KfvoError(f'{path}, pose {wrong[0]} (from 0): expected a rotation in the first '
+                        'three columns, found another matrix; are these poses?')
+    return Trajectory(np.asarray(stamps_ns, dtype=np.int64), poses)
 
 
 def _data_lines(path: Path) -> list[tuple[int, str]]:

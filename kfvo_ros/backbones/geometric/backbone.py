@@ -10,11 +10,12 @@ import cv2
 import numpy as np
 
 from kfvo_ros import geometry
-from kfvo_ros.backbones.base import Backbone, Encoded, Estimate, Previous, Status, Stream, Window
+from kfvo_ros.backbones.base import Backbone, Encoded, Estimate, Status, Stream, Window
 from kfvo_ros.backbones.geometric.initialisation import Initialiser
+from kfvo_ros.backbones.geometric.memory import Memory, recall
 from kfvo_ros.backbones.geometric.observations import View, tabulate
-from kfvo_ros.backbones.geometric.signals import SIGNAL_NAMES, Motion, measure_motion, signals
-from kfvo_ros.backbones.geometric.window import MIN_TRACKS, Solution, solve
+from kfvo_ros.backbones.geometric.signals import SIGNAL_NAMES, measure_motion, signals
+from kfvo_ros.backbones.geometric.window import solve
 from kfvo_ros.camera import Camera
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.images import to_grey
@@ -22,6 +23,8 @@ from kfvo_ros.sequences.base import Frame
 from kfvo_ros.tracking import Tracker
 
 THUMBNAIL = (8, 6)
+MIN_TRACKS = 8
+"""The newest frame needs as many tracks in common with the window to be placed."""
 HELD_PARALLAX = 1.0
 """With less parallax to every keyframe of the window a frame tells nothing of translation [px]."""
 LOST_VARIANCE = 1e2
@@ -75,31 +78,28 @@ class GeometricBackbone(Backbone):
 
 
 def _estimate(window: Window) -> Estimate:
-    views = [encoded.payload for encoded in window.frames]
-    previous = window.previous
-    rejected = previous.memory if previous is not None else np.zeros(0, dtype=np.int64)
-    observations = tabulate(views, rejected)
+    views = tuple(encoded.payload for encoded in window.frames)
+    previous, stream = window.previous, window.stream
+    history = recall(previous, views[0])
+    observations = tabulate(history.views + views, len(history.views))
     if observations.mask[:, -1].sum() < MIN_TRACKS:
         return _lost(window)
-    solution = solve(observations, window.stream.initialiser, previous)
-    placed = solution.inliers[:, -1].sum() >= MIN_TRACKS
-    if not placed or not np.isfinite(solution.T_anchor_frame).all():
+    solution = solve(observations, stream.initialiser, previous, history)
+    poses = solution.T_anchor_frame
+    if solution.inliers[:, -1].sum() < MIN_TRACKS or not np.isfinite(poses).all():
         return _lost(window)
-    motion = measure_motion(solution, views, window.stream.initialiser.focal)
-    status = Status.HELD if motion.window_parallax < HELD_PARALLAX else Status.OK
-    T_anchor_frame = solution.T_anchor_frame
-    T_anchor_frame[0] = np.eye(4)
-    rejected = np.union1d(rejected[np.isin(rejected, observations.ids)],
-                          observations.ids[~solution.solved])
-    return Estimate(T_anchor_frame, solution.covariance(), solution.points(),
-                    signals(solution, motion), status, rejected)
+    motion = measure_motion(solution, views[-2], views[-1], stream.initialiser.focal)
+    return Estimate(poses[solution.anchor:], solution.covariance(), solution.points(),
+                    signals(solution, motion),
+                    Status.HELD if motion.window_parallax < HELD_PARALLAX else Status.OK,
+                    Memory(history.views + views, poses,solution.certain))
 
 
 def _lost(window: Window) -> Estimate:
     """Return the known poses, and the last frame's for the new one."""
     frames = len(window.frames)
     T_anchor_frame = np.tile(np.eye(4), (frames, 1, 1))
-    points, memory = None, np.zeros(0, dtype=np.int64)
+    points, memory = None, Memory()
     if window.previous is not None:
         T_anchor_frame[:-1] = window.previous.T_anchor_frame
         T_anchor_frame[-1] = window.previous.T_anchor_latest

@@ -27,7 +27,7 @@ TINY = 1e-9
 class Problem:
     """What is measured in a window of F frames and P points; arrays as in `kernels`.
 
-    ``fixed`` (F,) frames are not moved. A point's inverse depth r is drawn to
+    The first ``fixed`` frames are not moved. A point's inverse depth r is drawn to
     ``prior_values`` (P,) with ``prior_weights`` (P,) [px^2 per unit squared].
     """
 
@@ -36,7 +36,7 @@ class Problem:
     seen: np.ndarray
     mask: np.ndarray
     focal: float
-    fixed: np.ndarray
+    fixed: int
     prior_weights: np.ndarray
     prior_values: np.ndarray
 
@@ -54,10 +54,13 @@ class State:
     inverse_depths: np.ndarray
 
     def stepped(self, pose_step: np.ndarray, depth_step: np.ndarray) -> State:
-        """Apply a step (6F,) and (P,)."""
+        """Apply a step (6 (F - fixed),) of the last frames and (P,)."""
         step = pose_step.reshape(-1, 6)
-        return State(self.rotations @ geometry.exp_so3(step[:, :3]),
-                     self.translations + step[:, 3:],
+        rotations, translations = self.rotations.copy(), self.translations.copy()
+        fixed = len(rotations) - len(step)
+        rotations[fixed:] = rotations[fixed:] @ geometry.exp_so3(step[:, :3])
+        translations[fixed:] += step[:, 3:]
+        return State(rotations, translations,
                      np.maximum(self.inverse_depths + depth_step, LEAST_INVERSE_DEPTH))
 
     def scaled(self, factor: float) -> State:
@@ -75,19 +78,17 @@ class NormalEquations:
     H_pp: np.ndarray
     g_p: np.ndarray
 
-    def reduce(self, damping: float, free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Eliminate the depths (Schur complement); return the system of the free poses."""
-        coupling = self.H_pc[:, free]
-        eliminated = coupling / (self.H_pp * (1.0 + damping) + TINY)[:, None]
-        system = self.H_cc[np.ix_(free, free)] - coupling.T @ eliminated
-        system[np.diag_indices(len(system))] += damping * self.H_cc.diagonal()[free] + TINY
-        return system, self.g_c[free] - eliminated.T @ self.g_p
+    def reduce(self, damping: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+        """Eliminate the depths (Schur complement); return system and gradient of the poses."""
+        eliminated = self.H_pc / (self.H_pp * (1.0 + damping) + TINY)[:, None]
+        system = self.H_cc - self.H_pc.T @ eliminated
+        system[np.diag_indices(len(system))] += damping * self.H_cc.diagonal() + TINY
+        return system, self.g_c - eliminated.T @ self.g_p
 
-    def step(self, damping: float, free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the damped Gauss-Newton step of poses (6F,) and inverse depths (P,)."""
-        system, gradient = self.reduce(damping, free)
-        poses = np.zeros(len(self.g_c))
-        poses[free] = -np.linalg.solve(system, gradient)
+    def step(self, damping: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return the damped Gauss-Newton step of free poses (C,) and inverse depths (P,)."""
+        system, gradient = self.reduce(damping)
+        poses = -np.linalg.solve(system, gradient)
         depths = -(self.g_p + self.H_pc @ poses) / (self.H_pp * (1.0 + damping) + TINY)
         return poses, depths
 
@@ -111,20 +112,19 @@ def linearise(problem: Problem, state: State) -> NormalEquations:
     """Return the normal equations at `state`, priors included."""
     H_cc, g_c, H_pc, H_pp, g_p = kernels.linearise(
         state.rotations, state.translations, state.inverse_depths, problem.hosts, problem.rays,
-        problem.seen, problem.mask, problem.focal, HUBER)
+        problem.seen, problem.mask, problem.focal, HUBER, problem.fixed)
     pull = problem.prior_weights * (state.inverse_depths - problem.prior_values)
     return NormalEquations(H_cc, g_c, H_pc, H_pp + problem.prior_weights, g_p + pull)
 
 
 def adjust(problem: Problem, state: State, iterations: int) -> State:
     """Return the state of least cost near `state`, in at most so many accepted steps."""
-    free = np.repeat(~problem.fixed, 6)
     damping = FIRST_DAMPING
     current = cost(problem, state)
     for _ in range(iterations):
         normal = linearise(problem, state)
         for _ in range(MAX_REJECTIONS):
-            candidate = state.stepped(*normal.step(damping, free))
+            candidate = state.stepped(*normal.step(damping))
             candidate_cost = cost(problem, candidate)
             if candidate_cost < current:
                 break

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from kfvo_ros import geometry
 from kfvo_ros.backbones.base import Previous
 from kfvo_ros.backbones.geometric import kernels
 from kfvo_ros.backbones.geometric.bundle_adjustment import State
+from kfvo_ros.backbones.geometric.memory import History
 from kfvo_ros.backbones.geometric.observations import Observations
 
 MIN_PAIR_TRACKS = 12
@@ -22,10 +24,20 @@ ENOUGH_TRACKS, ENOUGH_FLOW = 100, 50.0
 MIN_RESECTION_POINTS = 6
 NEAREST, FARTHEST = 0.02, 50.0
 """Triangulated inverse depths are believed within this range of the scene's median."""
+MAX_SPREAD = 0.7
+"""... and when one pixel moves them by less than this share of the median."""
 LEAST_INVERSE_DEPTH = 1e-4
 
 RELATIVE_POSE = {'max_epipolar_error': 1.0, 'max_iterations': 500, 'min_iterations': 50}
 ABSOLUTE_POSE = {'max_reproj_error': 3.0, 'max_iterations': 200, 'min_iterations': 20}
+
+
+@dataclass(frozen=True)
+class Guess:
+    """Where to start, and the inverse depths (P,) to expect when nothing better is measured."""
+
+    state: State
+    expected_inverse_depths: np.ndarray
 
 
 class Initialiser:
@@ -37,8 +49,8 @@ class Initialiser:
         self._camera = {'model': 'SIMPLE_PINHOLE', 'width': 1, 'height': 1,
                         'params': [focal, 0.0, 0.0]}
 
-    def from_nothing(self, observations: Observations) -> State:
-        """Return poses and depths of a window of which nothing is known, baseline 1.
+    def from_nothing(self, observations: Observations) -> Guess:
+        """Return poses and depths of a window of which nothing is known, median depth 1.
 
         The pair of frames with most tracks and flow gives the first two poses, the others are
         resected one by one from the points triangulated so far.
@@ -46,30 +58,35 @@ class Initialiser:
         frames = observations.mask.shape[1]
         T_first_frame = np.tile(np.eye(4), (frames, 1, 1))
         pair = self._best_pair(observations)
-        if pair is None:
-            return State(T_first_frame[:, :3, :3], T_first_frame[:, :3, 3],
-                         np.ones(len(observations)))
-        first, second = pair
-        T_first_frame[second] = self._relative_pose(observations, first, second)
-        placed = np.zeros(frames, dtype=bool)
-        placed[[first, second]] = True
-        remaining = [frame for frame in range(frames) if not placed[frame]]
-        for frame in sorted(remaining, key=lambda f: min(abs(f - first), abs(f - second))):
-            nearest = min(np.flatnonzero(placed), key=lambda other: abs(other - frame))
-            T_first_frame[frame] = self._resect_in_turn(
-                observations, T_first_frame, placed, frame, T_first_frame[nearest])
-            placed[frame] = True
+        if pair is not None:
+            first, second = pair
+            T_first_frame[second] = self._relative_pose(observations, first, second)
+            placed = np.isin(np.arange(frames), pair)
+            distance = np.minimum(abs(np.arange(frames) - first), abs(np.arange(frames) - second))
+            for frame in np.argsort(distance, kind='stable')[2:]:
+                nearest = min(np.flatnonzero(placed), key=lambda other: abs(other - frame))
+                T_first_frame[frame] = self._resect_in_turn(
+                    observations, T_first_frame, placed, frame, T_first_frame[nearest])
+                placed[frame] = True
         T_anchor_frame = geometry.relative(T_first_frame[0], T_first_frame)
-        return complete(observations, T_anchor_frame, np.full(len(observations), np.nan))
+        unknown = np.full(len(observations), np.nan)
+        state = self._complete(observations, T_anchor_frame, unknown)
+        state = state.scaled(float(np.median(state.inverse_depths)))
+        return Guess(state, np.ones(len(observations)))
 
-    def from_previous(self, observations: Observations, previous: Previous) -> State:
+    def from_previous(self, observations: Observations, previous: Previous,
+                      history: History) -> Guess:
         """Return the poses and depths known from earlier windows, and the new frame resected."""
-        T_anchor_frame = np.concatenate([previous.T_anchor_frame, previous.T_anchor_latest[None]])
-        inverse_depths = known_inverse_depths(observations, T_anchor_frame, previous)
-        visible = np.isfinite(inverse_depths) & observations.mask[:, -1]
-        T_anchor_frame[-1] = self._resect(observations, T_anchor_frame, inverse_depths, visible,
-                                          len(T_anchor_frame) - 1, previous.T_anchor_latest)
-        return complete(observations, T_anchor_frame, inverse_depths)
+        T_anchor_frame = np.concatenate([history.T_anchor_view, previous.T_anchor_frame,
+                                         previous.T_anchor_latest[None]])
+        known = known_inverse_depths(observations, T_anchor_frame, previous)
+        is_known = np.isfinite(known)
+        T_anchor_frame[-1] = self._resect(
+            observations, T_anchor_frame, known, is_known & observations.mask[:, -1],
+            len(T_anchor_frame) - 1, previous.T_anchor_latest)
+        state = self._complete(observations, T_anchor_frame, known)
+        median = np.median(known[is_known]) if is_known.any() else np.median(state.inverse_depths)
+        return Guess(state, np.where(is_known, known, median))
 
     def _best_pair(self, observations: Observations) -> tuple[int, int] | None:
         """Return the two frames whose relative pose is best determined."""
@@ -130,6 +147,19 @@ class Initialiser:
             return fallback
         return _inverse_of(pose)
 
+    def _complete(self, observations: Observations, T_anchor_frame: np.ndarray,
+                  inverse_depths: np.ndarray) -> State:
+        """Return the state with unknown (NaN) inverse depths triangulated, or the median's."""
+        unknown = ~np.isfinite(inverse_depths)
+        triangulated, weights = _triangulate(observations, T_anchor_frame)
+        believed = triangulated > LEAST_INVERSE_DEPTH
+        reference = triangulated[believed] if unknown.all() else inverse_depths[~unknown]
+        median = float(np.median(reference)) if len(reference) else 1.0
+        believed &= (triangulated > NEAREST * median) & (triangulated < FARTHEST * median)
+        believed &= self.focal * np.sqrt(weights) * MAX_SPREAD * median > 1.0
+        filled = np.where(unknown, np.where(believed, triangulated, median), inverse_depths)
+        return State(T_anchor_frame[:, :3, :3].copy(), T_anchor_frame[:, :3, 3].copy(), filled)
+
 
 def known_inverse_depths(observations: Observations, T_anchor_frame: np.ndarray,
                          previous: Previous) -> np.ndarray:
@@ -145,19 +175,6 @@ def known_inverse_depths(observations: Observations, T_anchor_frame: np.ndarray,
     in_front = depths > kernels.MIN_DEPTH
     inverse_depths[rows[in_front]] = 1.0 / depths[in_front]
     return inverse_depths
-
-
-def complete(observations: Observations, T_anchor_frame: np.ndarray,
-             inverse_depths: np.ndarray) -> State:
-    """Return the state with unknown (NaN) inverse depths triangulated, or the median's."""
-    unknown = ~np.isfinite(inverse_depths)
-    triangulated, weights = _triangulate(observations, T_anchor_frame)
-    believed = (triangulated > LEAST_INVERSE_DEPTH) & (weights > 1e-10)
-    reference = inverse_depths[~unknown] if not unknown.all() else triangulated[believed]
-    median = float(np.median(reference)) if len(reference) else 1.0
-    believed &= (triangulated > NEAREST * median) & (triangulated < FARTHEST * median)
-    filled = np.where(unknown, np.where(believed, triangulated, median), inverse_depths)
-    return State(T_anchor_frame[:, :3, :3].copy(), T_anchor_frame[:, :3, 3].copy(), filled)
 
 
 def _triangulate(observations: Observations,

@@ -95,31 +95,38 @@ def _differentiate(rotations, translations, h, j, ray, b, r, p, focal, J, J_dept
 
 
 @_compiled
-def _accumulate(J, J_depth, e0, e1, weight, h, j, k, H_cc, g_c, H_pc, H_pp, g_p):
-    """Add one observation to the normal equations."""
+def _accumulate(J, J_depth, e0, e1, weight, first_host, first_seen, k, H_cc, g_c, H_pc, H_pp,
+                g_p):
+    """Add one observation to the normal equations; rows of fixed frames are negative."""
     H_pp[k] += weight * (J_depth[0] ** 2 + J_depth[1] ** 2)
     g_p[k] += weight * (J_depth[0] * e0 + J_depth[1] * e1)
     for m in range(12):
-        row = 6 * h + m if m < 6 else 6 * j + m - 6
+        row = first_host + m if m < 6 else first_seen + m - 6
+        if (first_host if m < 6 else first_seen) < 0:
+            continue
         w0, w1 = weight * J[0, m], weight * J[1, m]
         g_c[row] += w0 * e0 + w1 * e1
         H_pc[k, row] += w0 * J_depth[0] + w1 * J_depth[1]
         for n in range(6):
-            H_cc[row, 6 * h + n] += w0 * J[0, n] + w1 * J[1, n]
-            H_cc[row, 6 * j + n] += w0 * J[0, n + 6] + w1 * J[1, n + 6]
+            if first_host >= 0:
+                H_cc[row, first_host + n] += w0 * J[0, n] + w1 * J[1, n]
+            if first_seen >= 0:
+                H_cc[row, first_seen + n] += w0 * J[0, n + 6] + w1 * J[1, n + 6]
 
 
 @_compiled
-def linearise(rotations, translations, inverse_depths, hosts, rays, seen, mask, focal, huber):
+def linearise(rotations, translations, inverse_depths, hosts, rays, seen, mask, focal, huber,
+              fixed):
     """Return the normal equations (H_cc, g_c, H_pc, H_pp, g_p) at the present estimate.
 
-    H_cc (6F, 6F) and g_c (6F,) belong to the poses (rotation, then translation, of each frame),
-    H_pp (P,) and g_p (P,) to the inverse depths, H_pc (P, 6F) couples them. H is the
-    Gauss-Newton Hessian and g the gradient of half the Huber cost.
+    The first `fixed` frames do not move. With C = 6 (F - fixed), H_cc (C, C) and g_c (C,)
+    belong to the poses (rotation, then translation, of each free frame), H_pp (P,) and g_p (P,)
+    to the inverse depths, H_pc (P, C) couples them. H is the Gauss-Newton Hessian and g the
+    gradient of half the Huber cost.
     """
     points, frames = mask.shape
-    H_cc, g_c = np.zeros((6 * frames, 6 * frames)), np.zeros(6 * frames)
-    H_pc = np.zeros((points, 6 * frames))
+    size = 6 * (frames - fixed)
+    H_cc, g_c, H_pc = np.zeros((size, size)), np.zeros(size), np.zeros((points, size))
     H_pp, g_p = np.zeros(points), np.zeros(points)
     J, J_depth = np.zeros((2, 12)), np.zeros(2)
     for k in range(points):
@@ -136,7 +143,8 @@ def linearise(rotations, translations, inverse_depths, hosts, rays, seen, mask, 
             error = math.sqrt(e0 * e0 + e1 * e1)
             weight = 1.0 if error < huber else huber / error
             _differentiate(rotations, translations, h, j, ray, rays[k], r, p, focal, J, J_depth)
-            _accumulate(J, J_depth, e0, e1, weight, h, j, k, H_cc, g_c, H_pc, H_pp, g_p)
+            _accumulate(J, J_depth, e0, e1, weight, 6 * (h - fixed), 6 * (j - fixed), k, H_cc,
+                        g_c, H_pc, H_pp, g_p)
     return H_cc, g_c, H_pc, H_pp, g_p
 
 

@@ -43,11 +43,12 @@ class Observations:
         return len(self.ids)
 
 
-def tabulate(views: Sequence[View], ignored: np.ndarray) -> Observations:
-    """Gather the tracks of `views`, oldest first, without the `ignored` ids."""
+def tabulate(views: Sequence[View], anchor: int) -> Observations:
+    """Gather the tracks of `views`, oldest first, that a frame after the anchor sees."""
     ids, counts = np.unique(np.concatenate([view.tracks.ids for view in views]),
                             return_counts=True)
-    ids = ids[(counts >= 2) & ~np.isin(ids, ignored)]
+    moving = np.unique(np.concatenate([view.tracks.ids for view in views[anchor + 1:]]))
+    ids = ids[(counts >= 2) & np.isin(ids, moving)]
     seen = np.zeros((len(ids), len(views), 2))
     mask = np.zeros((len(ids), len(views)), dtype=bool)
     for frame, view in enumerate(views):

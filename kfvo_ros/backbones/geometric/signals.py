@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,12 +32,12 @@ class Motion:
     gap: int
 
 
-def measure_motion(solution: Solution, views: Sequence[View], focal: float) -> Motion:
-    """Compare the newest frame with the others."""
-    keyframe, newest = views[-2], views[-1]
+def measure_motion(solution: Solution, keyframe: View, newest: View, focal: float) -> Motion:
+    """Compare the newest frame with the last keyframe and with the whole window."""
     shared = np.isin(keyframe.tracks.ids, newest.tracks.ids, assume_unique=True).sum()
-    last = len(views) - 1
-    parallaxes = [_median_shift(solution, frame, last, focal, True) for frame in range(last)]
+    last = solution.observations.mask.shape[1] - 1
+    parallaxes = [_median_shift(solution, frame, last, focal, True)
+                  for frame in range(solution.anchor, last)]
     return Motion(float(shared) / max(len(keyframe.tracks), 1),
                   _median_shift(solution, last - 1, last, focal, False), parallaxes[-1],
                   max(parallaxes), newest.index - keyframe.index)

@@ -11,33 +11,40 @@ import numpy as np
 from kfvo_ros import geometry
 from kfvo_ros.backbones.base import Points, Previous
 from kfvo_ros.backbones.geometric import bundle_adjustment as ba
-from kfvo_ros.backbones.geometric.initialisation import Initialiser, known_inverse_depths
+from kfvo_ros.backbones.geometric.initialisation import Guess, Initialiser
+from kfvo_ros.backbones.geometric.memory import History
 from kfvo_ros.backbones.geometric.observations import Observations
 
-MIN_TRACKS = 8
-"""The newest frame needs as many tracks in common with the window to be placed."""
-WARM_FRAMES = 4
-"""Smaller windows are started from nothing: too little is known of them to hold on to."""
 ITERATIONS, FINAL_ITERATIONS = 8, 4
 MAX_ERROR = 3.0
 """Observations farther off after the first adjustment are outliers [px]."""
 DEPTH_PRIOR = 1.0
-"""How strongly a point keeps its last depth: one such prior weighs as much as a residual of
-1 px for a depth wrong by 100 %. It keeps the scale through rotation and hovering."""
-PRIOR_FLOOR = 0.2
-PIXEL_NOISE_FLOOR = 0.1
+"""A depth wrong by 100 % costs as much as an observation wrong by the root of this [px].
+
+It keeps the scale through rotation and hovering, where nothing is measured."""
+LEAST_PRIOR_SPREAD = 0.2
+"""The same for points so far away that 100 % of their inverse depth is nothing: this share of
+the median's."""
+MIN_INFORMATION = 100.0
+"""The median depth is known to 10 % from tracks good to a pixel: worth to be held on to."""
+LEAST_NOISE = 0.1
 """Tracks are never believed to be better than this [px]."""
 
 
 @dataclass(frozen=True)
 class Solution:
-    """A solved window; ``inliers`` (P, F) is what is left of the observations."""
+    """A solved window; frame ``anchor`` is identity, those before it are its history.
+
+    ``inliers`` (P, F) is what is left of the observations, ``errors`` (P, F) theirs [px].
+    """
 
     observations: Observations
+    anchor: int
     state: ba.State
     inliers: np.ndarray
     errors: np.ndarray
     normal: ba.NormalEquations
+    cost: float
 
     @property
     def solved(self) -> np.ndarray:
@@ -46,8 +53,17 @@ class Solution:
 
     @property
     def T_anchor_frame(self) -> np.ndarray:
-        """Poses (F, 4, 4)."""
-        return geometry.make_transform(self.state.rotations, self.state.translations)
+        """Poses (F, 4, 4) of all frames, exactly identity for the anchor."""
+        poses = geometry.orthonormalise(
+            geometry.make_transform(self.state.rotations, self.state.translations))
+        poses[self.anchor] = np.eye(4)
+        return poses
+
+    @property
+    def certain(self) -> bool:
+        """Whether depths are measured well enough to be held on to."""
+        information = self.points().information
+        return len(information) > 0 and float(np.median(information)) > MIN_INFORMATION
 
     def points(self) -> Points:
         """Return the solved points; a depth's information is that given the poses."""
@@ -60,59 +76,59 @@ class Solution:
                       self.normal.H_pp[rows] * inverse_depths ** 2)
 
     def covariance(self) -> np.ndarray:
-        """Return covariances (F, 6, 6) in the anchor, translation first, anchor's zero.
+        """Return covariances (S, 6, 6) from the anchor on, in it, translation first.
 
-        The scale of the window is part of it, tied to the past by the depth priors alone: it
-        grows where points have no parallax, which reprojection errors would not show.
+        It contains how well the window's scale is tied to the past, by history and depth
+        priors: where points have no parallax it grows, which reprojection errors do not show.
         """
-        frames = len(self.state.rotations)
-        covariance = np.zeros((frames, 6, 6))
-        free = np.arange(6, 6 * frames)
-        system, _ = self.normal.reduce(0.0, free)
-        rms = np.median(self.errors[self.inliers & (self.errors > 0)]) if self.inliers.any() else 1.0
-        noise = max(PIXEL_NOISE_FLOOR, float(rms)) ** 2
-        blocks = noise * np.linalg.pinv(system, hermitian=True)
-        for frame in range(1, frames):
-            block = blocks[6 * frame - 6:6 * frame, 6 * frame - 6:6 * frame]
+        free = self.state.rotations[self.anchor + 1:]
+        measured = self.inliers & (self.errors > 0.0)
+        noise = max(LEAST_NOISE, float(np.median(self.errors[measured])) if measured.any() else 1.0)
+        system, _ = self.normal.reduce()
+        blocks = noise ** 2 * np.linalg.pinv(system, hermitian=True)
+        covariance = np.zeros((len(free) + 1, 6, 6))
+        for index, rotation in enumerate(free):
+            rows = slice(6 * index, 6 * index + 6)
             turn = np.zeros((6, 6))
-            turn[:3, 3:] = np.eye(3)
-            turn[3:, :3] = self.state.rotations[frame]
-            covariance[frame] = turn @ block @ turn.T
+            turn[:3, 3:], turn[3:, :3] = np.eye(3), rotation
+            covariance[index + 1] = turn @ blocks[rows, rows] @ turn.T
         return 0.5 * (covariance + np.swapaxes(covariance, 1, 2))
 
 
-def solve(observations: Observations, initialiser: Initialiser,
-          previous: Previous | None) -> Solution:
-    """Place the frames of a window in the anchor, in the unit of `previous`, else median depth 1."""
-    frames = observations.mask.shape[1]
-    warm = previous is not None and previous.points is not None and frames >= WARM_FRAMES
-    if warm:
-        state = initialiser.from_previous(observations, previous)
-    else:
-        state = initialiser.from_nothing(observations)
-        state = state.scaled(float(np.median(state.inverse_depths)))
-    problem = _problem(observations, initialiser.focal, state, previous if warm else None)
-    state = ba.adjust(problem, state, ITERATIONS)
+def solve(observations: Observations, initialiser: Initialiser, previous: Previous | None,
+          history: History) -> Solution:
+    """Place the frames of a window in the anchor, in the unit of `previous`, else median depth 1.
+
+    While little is known, a start from nothing competes with the one from the last window,
+    which may sit in a wrong minimum.
+    """
+    guesses = []
+    if previous is not None and previous.points is not None:
+        guesses.append(initialiser.from_previous(observations, previous, history))
+    if previous is None or not previous.memory.certain:
+        guesses.append(initialiser.from_nothing(observations))
+    return min((_solve_from(observations, initialiser.focal, guess, len(history.views))
+                for guess in guesses), key=lambda solution: solution.cost)
+
+
+def _solve_from(observations: Observations, focal: float, guess: Guess,
+                anchor: int) -> Solution:
+    """Adjust, take out the outliers, adjust again."""
+    problem = _problem(observations, focal, guess, anchor + 1)
+    state = ba.adjust(problem, guess.state, ITERATIONS)
+    first_cost = ba.cost(problem, state)
     inliers = observations.mask & (ba.reprojection_errors(problem, state) <= MAX_ERROR)
     inliers &= (inliers.sum(axis=1) >= 2)[:, None]
     if (inliers != observations.mask).any():
         problem = problem.observed(inliers)
         state = ba.adjust(problem, state, FINAL_ITERATIONS)
-    return Solution(observations, state, inliers, ba.reprojection_errors(problem, state),
-                    ba.linearise(problem, state))
+    return Solution(observations, anchor, state, inliers, ba.reprojection_errors(problem, state),
+                    ba.linearise(problem, state), first_cost)
 
 
-def _problem(observations: Observations, focal: float, state: ba.State,
-             previous: Previous | None) -> ba.Problem:
-    """Return the bundle adjustment of a window, depths drawn to where they were or the median."""
-    expected = np.full(len(observations), np.median(state.inverse_depths))
-    if previous is not None:
-        poses = geometry.make_transform(state.rotations, state.translations)
-        known = known_inverse_depths(observations, poses, previous)
-        expected = np.where(np.isfinite(known), known,
-                            np.median(known[np.isfinite(known)]) if np.isfinite(known).any() else expected)
-    spread = np.maximum(expected, PRIOR_FLOOR * np.median(expected))
-    fixed = np.zeros(observations.mask.shape[1], dtype=bool)
-    fixed[0] = True
+def _problem(observations: Observations, focal: float, guess: Guess, fixed: int) -> ba.Problem:
+    """Return the bundle adjustment of a window, depths drawn to where they are expected."""
+    expected = guess.expected_inverse_depths
+    spread = np.maximum(expected, LEAST_PRIOR_SPREAD * np.median(expected))
     return ba.Problem(observations.hosts, observations.rays, observations.seen, observations.mask,
                       focal, fixed, DEPTH_PRIOR / spread ** 2, expected)

@@ -1,0 +1,56 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What a solved window leaves to the next one of its stream."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from kfvo_ros import geometry
+from kfvo_ros.backbones.base import Previous
+from kfvo_ros.backbones.geometric.observations import View
+
+HISTORY = 8
+"""So many keyframes that left the window go on being observed, at the poses they left with.
+
+A window of eight frames forgets what it knew of depth; these long baselines are what keeps the
+scale. They are final and cost no unknowns.
+"""
+
+
+@dataclass(frozen=True)
+class Memory:
+    """The views of a window and its history at ``T_anchor_view``.
+
+    ``certain`` says that depths were measured well enough to hold later windows to them.
+    """
+
+    views: tuple[View, ...] = ()
+    T_anchor_view: np.ndarray = field(default_factory=lambda: np.zeros((0, 4, 4)))
+    certain: bool = False
+
+
+@dataclass(frozen=True)
+class History:
+    """Views older than the anchor, and where they are in it, in trajectory units."""
+
+    views: tuple[View, ...] = ()
+    T_anchor_view: np.ndarray = field(default_factory=lambda: np.zeros((0, 4, 4)))
+
+
+def recall(previous: Previous | None, anchor: View) -> History:
+    """Return the keyframes before `anchor` that the last window knew for certain."""
+    if previous is None or not previous.memory.certain:
+        return History()
+    memory = previous.memory
+    indices = [view.index for view in memory.views]
+    if anchor.index not in indices:
+        return History()
+    position = indices.index(anchor.index)
+    start = max(0, position - HISTORY)
+    T_anchor_view = geometry.relative(memory.T_anchor_view[position],
+                                      memory.T_anchor_view[start:position])
+    T_anchor_view[:, :3, 3] *= previous.memory_scale
+    return History(memory.views[start:position], T_anchor_view)
