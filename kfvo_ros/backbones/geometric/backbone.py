@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The backbone for any CPU: KLT tracks and windowed bundle adjustment."""
+"""The geometric backbone against the contract: encode by tracking, estimate by solving."""
 
 from __future__ import annotations
 

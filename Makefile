@@ -1,0 +1,69 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+#
+# A virtual environment, the tests, and nothing that touches the system's Python.
+
+SHELL := /bin/sh
+KFVO_DATA ?= ../shared/data
+unexport KFVO_DATA
+comma := ,
+
+# A sourced ROS brings its own rclpy, Python and numpy; elsewhere the wheels of the `ros` extra
+# do, which exist for Linux on x86-64.
+ifneq ($(ROS_DISTRO),)
+CONSTRAINTS ?= constraints-jazzy.txt
+CANDIDATES := python3
+VENV_OPTIONS := --system-site-packages
+EXTRAS ?= test
+else
+CONSTRAINTS ?= constraints.txt
+CANDIDATES := python3.13 python3.12 python3.11 python3.10 python3
+EXTRAS ?= $(if $(findstring Linux x86_64,$(shell uname -sm)),ros$(comma))test
+endif
+
+# One environment per constraints file, .venv and .venv-jazzy, and others under a sourced ROS.
+PINS := $(basename $(notdir $(CONSTRAINTS)))
+VENV := .venv$(PINS:constraints%=%)$(if $(ROS_DISTRO),-ros)
+INSTALLED := $(VENV)/.installed
+NEWEST := $(if $(findstring jazzy,$(CONSTRAINTS)),12,13)
+
+# The first candidate that runs and has a wheel of every pinned package.
+SUPPORTED := import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, $(NEWEST)))
+ifndef PYTHON
+PYTHON := $(shell for python in $(CANDIDATES); do \
+	$$python -c '$(SUPPORTED)' 2>/dev/null && echo $$python && break; done)
+endif
+
+.PHONY: help test lint clean
+
+help:
+	@echo 'make test    install into $(VENV) and run ruff and the tests'
+	@echo 'make lint    ruff and mypy'
+	@echo 'make clean   remove the environments and all that was built'
+	@echo
+	@echo 'CONSTRAINTS=$(CONSTRAINTS)  exact versions; constraints-jazzy.txt has numpy 1.26'
+	@echo 'KFVO_DATA=$(KFVO_DATA)  sequences for the tests that want some'
+	@echo 'PYTHON=$(PYTHON)  Python 3.10 to 3.$(NEWEST)'
+
+test: $(INSTALLED)
+	$(VENV)/bin/ruff check .
+	[ ! -d '$(KFVO_DATA)' ] || export KFVO_DATA="$$(cd '$(KFVO_DATA)' && pwd)"; \
+	PYTEST_DISABLE_PLUGIN_AUTOLOAD=1 $(VENV)/bin/python -m pytest -rs
+
+lint: $(INSTALLED)
+	$(VENV)/bin/ruff check .
+	$(VENV)/bin/mypy
+
+$(INSTALLED): setup.py pyproject.toml $(CONSTRAINTS)
+	@test -n '$(PYTHON)' || { echo 'No Python 3.10 to 3.$(NEWEST) found among: $(CANDIDATES).' \
+		'Install one, or name it: make test PYTHON=/path/to/python3' >&2; exit 1; }
+	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { \
+		echo '$(PYTHON) cannot make virtual environments: apt install python3-venv' >&2; exit 1; }
+	$(PYTHON) -m venv --clear $(VENV_OPTIONS) $(VENV)
+	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check \
+		--constraint $(CONSTRAINTS) --editable '.[$(EXTRAS)]'
+	@touch $@
+
+clean:
+	rm -rf .venv* build install log demo *.egg-info .pytest_cache .ruff_cache .mypy_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

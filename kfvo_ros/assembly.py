@@ -1,0 +1,62 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""From options to working parts."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kfvo_ros import geometry
+from kfvo_ros.backbones.base import Backbone
+from kfvo_ros.camera import read_camera_info
+from kfvo_ros.errors import KfvoError
+from kfvo_ros.keyframes.base import KeyframePolicy
+from kfvo_ros.keyframes.heuristics import Every, OpticalFlow, Survival
+from kfvo_ros.odometry import KeyframeOdometry
+from kfvo_ros.options import OdometryOptions, SequenceOptions
+from kfvo_ros.sequences import open_sequence
+from kfvo_ros.sequences.base import Sequence
+
+
+def make_backbone(options: OdometryOptions) -> Backbone:
+    """Return the backbone that `options` name, ready for its first frame."""
+    from kfvo_ros.backbones.geometric.backbone import GeometricBackbone
+    return GeometricBackbone(options.seed)
+
+
+def make_policy(options: OdometryOptions) -> KeyframePolicy:
+    """Return the keyframe policy that `options` name."""
+    if options.keyframes == 'every':
+        return Every()
+    if options.keyframes == 'optical_flow':
+        return OpticalFlow(options.flow_threshold)
+    return Survival(options.survival_share)
+
+
+def make_odometry(options: OdometryOptions) -> KeyframeOdometry:
+    """Return the odometry that `options` describe."""
+    return KeyframeOdometry(make_backbone(options), make_policy(options), options.scale,
+                            options.window_size)
+
+
+def make_sequence(text: str, options: SequenceOptions) -> Sequence:
+    """Open the sequence; raises KfvoError."""
+    return open_sequence(
+        text, kind=options.kind, image_topic=options.image_topic,
+        camera=read_camera_info(options.camera) if options.camera else None,
+        ground_truth_topic=options.ground_truth_topic,
+        ground_truth_to_camera=parse_transform(options.ground_truth_to_camera),
+        rate=options.rate)
+
+
+def parse_transform(text: str | None) -> np.ndarray | None:
+    """Return T (4, 4) of ``x y z qx qy qz qw``; raises KfvoError."""
+    if text is None:
+        return None
+    try:
+        numbers = np.array([float(part) for part in text.replace(',', ' ').split()])
+    except ValueError:
+        numbers = np.zeros(0)
+    if len(numbers) != 7 or not np.isfinite(numbers).all() or np.linalg.norm(numbers[3:]) < 1e-3:
+        raise KfvoError(f'expected seven numbers "x y z qx qy qz qw", came {text!r}')
+    return geometry.make_transform(geometry.rotation_from_quat_xyzw(numbers[3:]), numbers[:3])

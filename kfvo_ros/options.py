@@ -1,0 +1,94 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What users may choose, declared once: command lines (and the node's parameters) follow."""
+
+from __future__ import annotations
+
+import argparse
+import types
+import typing
+from dataclasses import MISSING, dataclass, field, fields
+from typing import Any, TypeVar
+
+from kfvo_ros.keyframes import POLICIES
+from kfvo_ros.scale import SCALE_RULES
+
+Options = TypeVar('Options')
+
+
+def option(default: Any, description: str, choices: tuple[str, ...] = (), least: float | None = None,
+           most: float | None = None) -> Any:
+    """Declare one field: its default, what it does, and what it may be."""
+    return field(default=default, metadata={'description': description, 'choices': choices,
+                                            'least': least, 'most': most})
+
+
+@dataclass(frozen=True)
+class OdometryOptions:
+    """The method's choices."""
+
+    backbone: str = option('geometric', 'model that places the frames of a window',
+                           ('geometric',))
+    scale: str | None = option(None, "scale alignment between windows; default the backbone's own",
+                               SCALE_RULES)
+    keyframes: str = option('survival', 'policy that decides which frames stay', POLICIES)
+    flow_threshold: float = option(
+        50.0, 'optical_flow: keep when the tracks moved farther since the last keyframe [px]',
+        least=0.0)
+    survival_share: float = option(
+        0.8, "survival: keep when fewer of the last keyframe's tracks are left", least=0.0,
+        most=1.0)
+    window_size: int = option(8, 'frames in a window', least=3, most=32)
+    seed: int = option(0, 'seed of every random choice', least=0)
+
+
+@dataclass(frozen=True)
+class SequenceOptions:
+    """How a sequence is read."""
+
+    kind: str | None = option(
+        None, 'kind of sequence (euroc, tum, kitti, tartanair, bag, folder, video, synthetic); '
+        'default: detected')
+    camera: str | None = option(None, 'calibration (camera_info.yaml) that wins over all others')
+    image_topic: str | None = option(None, 'image topic of a bag; default: the first by name')
+    ground_truth_topic: str | None = option(None, 'ground truth topic of a bag')
+    ground_truth_to_camera: str | None = option(
+        None, 'where the camera is on the body of the ground truth: "x y z qx qy qz qw"')
+    rate: float = option(10.0, 'frames per second of what has no stamps [Hz]', least=1e-3)
+    stop: int | None = option(None, 'stop after so many frames', least=1)
+
+
+def add_arguments(parser: argparse.ArgumentParser, options: type) -> None:
+    """Add one ``--name`` for each field of an options dataclass."""
+    group = parser.add_argument_group(options.__doc__.splitlines()[0].rstrip('.'))
+    for declared in fields(options):
+        meta = declared.metadata
+        default = '' if declared.default in (None, MISSING) else ' (default: %(default)s)'
+        group.add_argument(
+            f'--{declared.name.replace("_", "-")}', default=declared.default,
+            choices=meta['choices'] or None, type=_parser_of(options, declared.name, meta),
+            metavar=None if meta['choices'] else declared.name.upper(),
+            help=meta['description'] + default)
+
+
+def from_arguments(options: type[Options], arguments: argparse.Namespace) -> Options:
+    """Build the dataclass from parsed arguments."""
+    return options(**{declared.name: getattr(arguments, declared.name)
+                      for declared in fields(options)})
+
+
+def _parser_of(options: type, name: str, meta: Any) -> Any:
+    """Return a function from text to the field's type, within its range."""
+    hint = typing.get_type_hints(options)[name]
+    kind = next(part for part in typing.get_args(hint) or (hint,) if part is not types.NoneType)
+
+    def parse(text: str) -> Any:
+        value = kind(text)
+        if kind is not str and not (meta['least'] is None or value >= meta['least']):
+            raise argparse.ArgumentTypeError(f'expected at least {meta["least"]}, came {text}')
+        if kind is not str and not (meta['most'] is None or value <= meta['most']):
+            raise argparse.ArgumentTypeError(f'expected at most {meta["most"]}, came {text}')
+        return value
+
+    parse.__name__ = kind.__name__
+    return parse

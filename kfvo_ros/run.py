@@ -1,0 +1,115 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""``python -m kfvo_ros.run SEQUENCE --output DIR``: odometry over every frame of a sequence."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import signal
+import sys
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+from kfvo_ros import __version__
+from kfvo_ros.errors import KfvoError
+
+EXAMPLES = """examples:
+  python -m kfvo_ros.run synthetic:7 --output out
+  python -m kfvo_ros.run .../rgbd_dataset_freiburg1_desk --output out --keyframes every
+  python -m kfvo_ros.run MH_01_easy.bag --image-topic /cam0/image_raw --camera cam0.yaml --output out
+"""
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; return its exit status."""
+    logging.basicConfig(format='kfvo_run: %(levelname)s: %(message)s', level=logging.WARNING)
+    try:
+        return _run(argv)
+    except ModuleNotFoundError as error:
+        from kfvo_ros.requirements import missing_dependency
+        problem: Exception = missing_dependency(error)
+    except KfvoError as error:
+        problem = error
+    except KeyboardInterrupt:
+        problem = KfvoError('interrupted before the first frame')
+    print(f'kfvo_run: error: {problem}', file=sys.stderr)
+    return 1
+
+
+def _run(argv: list[str] | None) -> int:
+    from kfvo_ros import assembly
+    from kfvo_ros.options import OdometryOptions, SequenceOptions, from_arguments
+    from kfvo_ros.results import ResultWriter
+    from kfvo_ros.threads import single_threaded
+    arguments = _parse(argv)
+    odometry_options = from_arguments(OdometryOptions, arguments)
+    sequence_options = from_arguments(SequenceOptions, arguments)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    with single_threaded():
+        sequence = assembly.make_sequence(arguments.sequence, sequence_options)
+        odometry = assembly.make_odometry(odometry_options)
+        truth = sequence.ground_truth()
+        writer = ResultWriter(Path(arguments.output), arguments.overwrite)
+        problem = _process(sequence, odometry, writer, sequence_options.stop)
+        writer.append(odometry.finish())
+        about = {'sequence': sequence.name, 'backbone': odometry.backbone.name,
+                 'keyframe_policy': odometry.policy.name, 'scale_rule': odometry.scale.rule,
+                 'seed': odometry_options.seed, 'version': __version__}
+        summary = writer.finish(about | ({'ended_early': problem} if problem else {}), truth)
+    print(_describe(summary, writer.folder))
+    if problem:
+        print(f'kfvo_run: error: {problem}; what was computed is in {writer.folder}',
+              file=sys.stderr)
+    return 1 if problem else 0
+
+
+def _parse(argv: list[str] | None) -> argparse.Namespace:
+    from kfvo_ros.options import OdometryOptions, SequenceOptions, add_arguments
+    parser = argparse.ArgumentParser(
+        prog='kfvo_run', description='Visual odometry over every frame of a sequence.',
+        epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('sequence', help='dataset folder, bag, folder of images, video, or '
+                        'synthetic:SEED[:smooth|fast|mixed]')
+    parser.add_argument('--output', required=True, help='folder for trajectory.tum, '
+                        'keyframes.tum and summary.json')
+    parser.add_argument('--overwrite', action='store_true', help='replace earlier results')
+    parser.add_argument('--version', action='version', version=f'kfvo_ros {__version__}')
+    add_arguments(parser, OdometryOptions)
+    add_arguments(parser, SequenceOptions)
+    return parser.parse_args(argv)
+
+
+def _process(sequence: Any, odometry: Any, writer: Any, stop: int | None) -> str | None:
+    """Feed the frames; return why it ended before the end, if it did."""
+    from tqdm import tqdm
+    total = sequence.length if stop is None else min(stop, sequence.length or stop)
+    try:
+        for frame in tqdm(islice(sequence, stop), total=total, unit='frame', desc=sequence.name):
+            writer.update(odometry.process(frame))
+    except KeyboardInterrupt:
+        return 'interrupted'
+    except KfvoError as error:
+        return str(error)
+    return None
+
+
+def _describe(summary: dict[str, Any], folder: Path) -> str:
+    """Return the few lines a person wants to see at the end."""
+    total = summary['ms_per_frame'].get('total', {'median': 0.0, 'p95': 0.0})
+    lines = [f'{summary["frames"]} frames, {summary["keyframes"]} keyframes, '
+             f'{summary["lost_frames"]} lost; {total["median"]:.1f} ms per frame '
+             f'(95 %: {total["p95"]:.1f})']
+    if 'ate_rmse_m' in summary:
+        share = 100.0 * summary['ate_rmse_m'] / max(summary['path_length_m'], 1e-9)
+        lines.append(f'ATE {summary["ate_rmse_m"]:.4f} m RMSE after Sim(3) alignment, '
+                     f'{share:.2f} % of {summary["path_length_m"]:.2f} m')
+    elif 'ground_truth_problem' in summary:
+        lines.append(f'no ATE: {summary["ground_truth_problem"]}')
+    lines.append(f'{folder}/trajectory.tum (the scale of a single camera is not metric)')
+    return '\n'.join(lines)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,55 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The camera of a bag's images: its CameraInfo."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+from kfvo_ros.camera import Camera
+from kfvo_ros.errors import KfvoError
+from kfvo_ros.sequences.bag_reader import CAMERA_INFO, Bag
+
+
+def read_bag_camera(bag: Bag, image_topic: str, width: int, height: int) -> Camera | None:
+    """Return the camera of a topic's images, None where the bag has no calibration of it.
+
+    CameraInfo is looked for beside the images (/cam0/image_raw: /cam0/camera_info). Topics with
+    ``rect`` in their name are rectified: their camera is P, without distortion.
+    """
+    namespace, _, image_name = image_topic.removesuffix('/compressed').rpartition('/')
+    info_topic = f'{namespace}/camera_info'
+    if bag.topics.get(info_topic) != CAMERA_INFO:
+        return None
+    info = bag.first(info_topic)
+    if bag.is_ros1:  # whose message calls them K, D and P
+        info = SimpleNamespace(**{name.lower(): value for name, value in vars(info).items()})
+    try:
+        return camera_from_info(info, 'rect' in image_name, width, height)
+    except KfvoError as error:
+        raise KfvoError(f'{bag.path}, {info_topic}: {error}; '
+                        'or give the calibration with --camera') from error
+
+
+def camera_from_info(info: Any, rectified: bool, width: int, height: int) -> Camera | None:
+    """Return the camera of a sensor_msgs/CameraInfo, None where it says uncalibrated.
+
+    `width` and `height` stand in for a size it leaves zero. Raises KfvoError for binning or a
+    region of interest, which the numbers of the full sensor do not describe.
+    """
+    width, height = int(info.width) or width, int(info.height) or height
+    roi = info.roi
+    whole = (roi.x_offset, roi.y_offset) == (0, 0) and \
+        (roi.width, roi.height) in ((0, 0), (width, height))
+    if not whole or max(info.binning_x, info.binning_y) > 1:
+        raise KfvoError('expected images of the whole sensor, came binning or a region of '
+                        'interest, which are not supported; record without')
+    matrix, columns = (info.p, 4) if rectified else (info.k, 3)
+    fx, cx, fy, cy = (float(matrix[index]) for index in (0, 2, columns + 1, columns + 2))
+    if fx == 0.0:
+        return None
+    if rectified:
+        return Camera(width, height, fx, fy, cx, cy)
+    return Camera(width, height, fx, fy, cx, cy, info.distortion_model,
+                  tuple(float(value) for value in info.d))

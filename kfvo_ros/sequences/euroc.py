@@ -1,0 +1,100 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""EuRoC MAV in the ASL layout: mav0/cam0 with data.csv and sensor.yaml.
+
+Source: Burri et al., "The EuRoC micro aerial vehicle datasets", IJRR 2016.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from kfvo_ros import geometry
+from kfvo_ros.camera import Camera
+from kfvo_ros.errors import KfvoError
+from kfvo_ros.sequences.base import GroundTruth
+from kfvo_ros.sequences.calibration import Calibration, rigid_transform
+from kfvo_ros.sequences.image_list import ImageListSequence
+from kfvo_ros.sequences.kind import Kind, Options
+from kfvo_ros.sequences.text_rows import parse_floats, read_rows
+from kfvo_ros.trajectory import Trajectory
+
+
+def open_euroc(path: Path, options: Options) -> ImageListSequence:
+    """Open the left camera of a sequence; `path` is mav0 or its parent."""
+    root = path / 'mav0' if (path / 'mav0').is_dir() else path
+    folder = root.parent if root.name == 'mav0' else root
+    sensor_file = root / 'cam0' / 'sensor.yaml'
+    images = read_rows(root / 'cam0' / 'data.csv', 'timestamp [ns],filename', _parse_image)
+    calibration = Calibration(options.camera, folder, partial(_read_camera, sensor_file))
+    return ImageListSequence(folder.name, root / 'cam0' / 'data', images, calibration,
+                             partial(_read_ground_truth, root, sensor_file))
+
+
+def _matches(path: Path) -> bool:
+    return any((root / 'cam0' / 'data.csv').is_file() for root in (path, path / 'mav0'))
+
+
+KIND = Kind('euroc', 'EuRoC: a folder with mav0/cam0/data.csv', _matches, open_euroc)
+
+
+def _parse_image(line: str) -> tuple[int, str]:
+    stamp_ns, file_name = line.split(',')[:2]
+    return int(stamp_ns), file_name.strip()
+
+
+def _read_sensor(path: Path) -> dict[str, Any]:
+    """Read a sensor.yaml, whose first line ``%YAML:1.0`` is OpenCV's and not YAML."""
+    try:
+        lines = path.read_text(encoding='utf-8').splitlines()
+        sensor = yaml.safe_load('\n'.join(line for line in lines if not line.startswith('%')))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        reason = ' '.join(str(error).split())
+        raise KfvoError(f'cannot read {path}: {reason}') from error
+    if not isinstance(sensor, dict):
+        raise KfvoError(f'{path}: expected the keys of an EuRoC sensor, found {sensor!r:.80}')
+    return sensor
+
+
+def _read_camera(sensor_file: Path, width: int, height: int) -> Camera | None:
+    if not sensor_file.is_file():
+        return None
+    sensor = _read_sensor(sensor_file)
+    try:
+        width, height = map(int, sensor['resolution'])
+        fx, fy, cx, cy = map(float, sensor['intrinsics'])
+        return Camera(width, height, fx, fy, cx, cy, str(sensor['distortion_model']),
+                      tuple(map(float, sensor['distortion_coefficients'])))
+    except (KeyError, TypeError, ValueError, KfvoError) as error:
+        raise KfvoError(f'{sensor_file}: expected resolution [2], intrinsics [4], '
+                        'distortion_model and distortion_coefficients; '
+                        f'problem: {error}') from error
+
+
+def _read_ground_truth(root: Path, sensor_file: Path) -> GroundTruth | None:
+    """Read T_world_body, quaternion w first, and move it to the camera by the sensor's T_BS."""
+    path = root / 'state_groundtruth_estimate0' / 'data.csv'
+    if not path.is_file():
+        return None
+    rows = read_rows(path, 'timestamp [ns], p x y z, q w x y z, ...', _parse_pose)
+    values = np.array([row for _, row in rows]).reshape(-1, 7)
+    rotations = geometry.rotation_from_quat_xyzw(values[:, [4, 5, 6, 3]])
+    body = Trajectory(np.array([stamp_ns for stamp_ns, _ in rows], dtype=np.int64),
+                      geometry.make_transform(rotations, values[:, :3]))
+    extrinsics = _read_sensor(sensor_file).get('T_BS')
+    if not isinstance(extrinsics, dict):
+        raise KfvoError(f'{sensor_file}: expected T_BS with 16 numbers under data')
+    return GroundTruth(body.moved(rigid_transform(extrinsics.get('data'), f'{sensor_file}, T_BS')))
+
+
+def _parse_pose(line: str) -> tuple[int, list[float]]:
+    stamp_ns, *fields = line.split(',')
+    values = parse_floats(fields[:7], 7)
+    if not any(values[3:]):
+        raise ValueError('a quaternion of zeros')
+    return int(stamp_ns), values

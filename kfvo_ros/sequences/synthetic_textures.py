@@ -1,0 +1,280 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What the surfaces of the rendered room look like: painted once per sequence from its seed.
+
+Only `RandomState.random_sample` is drawn from, whose stream is frozen and which is exact on
+every platform, and only elementwise arithmetic is used: a texture is the same bytes everywhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from kfvo_ros.sequences.rendering import LEVEL_STARTS, TEXTURE_BITS, TEXTURE_SIZE
+
+SIZE = TEXTURE_SIZE
+
+
+class Dice:
+    """Random numbers that are the same for ever."""
+
+    def __init__(self, *key: int) -> None:
+        self._random = np.random.RandomState(list(key))
+
+    def unit(self, *shape: int) -> np.ndarray:
+        """Return numbers of [0, 1)."""
+        return self._random.random_sample(shape)
+
+    def between(self, low: float, high: float) -> float:
+        """Return a number of [low, high)."""
+        return low + (high - low) * float(self._random.random_sample())
+
+    def integer(self, low: int, high: int) -> int:
+        """Return an integer of [low, high)."""
+        return low + int((high - low) * float(self._random.random_sample()))
+
+    def chance(self, probability: float) -> bool:
+        """Return True with a probability."""
+        return self.between(0.0, 1.0) < probability
+
+    def shuffled(self, items: list) -> list:
+        """Return the items in a random order."""
+        return [items[place] for place in np.argsort(self.unit(len(items)), kind='stable')]
+
+
+def build_pyramid(texture: np.ndarray) -> np.ndarray:
+    """Return all levels (LEVEL_STARTS[-1],) uint8 of a texture (SIZE, SIZE), finest first."""
+    level = np.clip(np.floor(texture + 0.5), 0, 255).astype(np.uint16)
+    levels = [level]
+    for _ in range(TEXTURE_BITS):
+        level = (level[::2, ::2] + level[1::2, ::2] + level[::2, 1::2] + level[1::2, 1::2]
+                 + 2) >> 2
+        levels.append(level)
+    pyramid = np.concatenate([level.ravel() for level in levels]).astype(np.uint8)
+    assert len(pyramid) == LEVEL_STARTS[-1]
+    return pyramid
+
+
+def noise(dice: Dice, rows: int, columns: int) -> np.ndarray:
+    """Return smooth periodic noise (SIZE, SIZE) in [-1, 1] with rows x columns random values."""
+    lattice = 2.0 * dice.unit(rows, columns) - 1.0
+
+    def blend(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        place = np.arange(SIZE) * (count / SIZE)
+        before = place.astype(np.int64)
+        share = place - before
+        return before, (before + 1) % count, share * share * (3.0 - 2.0 * share)
+
+    before, after, share = blend(rows)
+    lines = lattice[before] * (1.0 - share[:, None]) + lattice[after] * share[:, None]
+    before, after, share = blend(columns)
+    return lines[:, before] * (1.0 - share) + lines[:, after] * share
+
+
+def fractal(dice: Dice, coarsest: int, finest: int, decay: float) -> np.ndarray:
+    """Return a sum (SIZE, SIZE) of noise from `coarsest` to `finest` cells, doubling."""
+    total, weight, cells = np.zeros((SIZE, SIZE)), 1.0, coarsest
+    while cells <= finest:
+        total += weight * noise(dice, cells, cells)
+        weight, cells = weight * decay, cells * 2
+    return total
+
+
+def plaster(dice: Dice) -> np.ndarray:
+    """Return a painted wall: next to nothing to see."""
+    return 128.0 + 22.0 * fractal(dice, 2, 32, 0.75) + 14.0 * fractal(dice, 64, 256, 0.9)
+
+
+def concrete(dice: Dice) -> np.ndarray:
+    """Return bare concrete with stains and pores."""
+    wall = 120.0 + 26.0 * fractal(dice, 4, 128, 0.8)
+    wall -= 90.0 * np.clip(noise(dice, 128, 128) - 0.72, 0.0, 1.0) * 3.0
+    return wall - 45.0 * np.clip(fractal(dice, 8, 32, 0.7) - 0.7, 0.0, 1.0)
+
+
+def brick(dice: Dice) -> np.ndarray:
+    """Return a brick wall: sixteen courses of four bricks."""
+    course, length, joint = SIZE // 16, SIZE // 4, 5
+    wall = np.full((SIZE, SIZE), 165.0)
+    for row in range(16):
+        shift = (row % 2) * length // 2
+        for column in range(4):
+            rows = slice(row * course + joint, (row + 1) * course)
+            columns = (np.arange(length - joint) + column * length + shift) % SIZE
+            wall[rows, columns] = dice.between(70.0, 125.0)
+    return wall + 16.0 * fractal(dice, 32, 256, 0.8)
+
+
+def wallpaper(dice: Dice) -> np.ndarray:
+    """Return stripes with a motif, differently worn from place to place."""
+    paper = np.full((SIZE, SIZE), 150.0)
+    y, x = np.mgrid[:SIZE, :SIZE]
+    step = SIZE // 8
+    paper[:, (np.arange(SIZE) // (step // 2)) % 2 == 0] -= dice.between(15.0, 35.0)
+    radius = dice.between(10.0, 18.0)
+    squared = ((x + (y // step % 2) * (step // 2)) % step - step / 2) ** 2 + (
+        y % step - step / 2) ** 2
+    paper[squared < radius * radius] += dice.between(30.0, 60.0)
+    paper[squared < 0.2 * radius * radius] -= 70.0
+    return paper + 12.0 * fractal(dice, 4, 256, 0.85)
+
+
+def planks(dice: Dice) -> np.ndarray:
+    """Return a wooden floor of eight planks with grain, each laid in two lengths."""
+    width = SIZE // 8
+    floor = np.empty((SIZE, SIZE))
+    for plank in range(8):
+        start = dice.integer(0, SIZE)
+        rows = slice(plank * width, (plank + 1) * width)
+        tone = np.full(SIZE, dice.between(95.0, 150.0))
+        tone[(np.arange(SIZE // 2) + start) % SIZE] = dice.between(95.0, 150.0)
+        tone[[start, (start + 1) % SIZE, (start + SIZE // 2) % SIZE]] = 55.0
+        floor[rows] = tone
+        floor[plank * width:plank * width + 2] = 50.0
+    floor += 14.0 * noise(dice, 256, 8) + 12.0 * noise(dice, 128, 16)
+    knots = np.clip(noise(dice, 32, 32) - 0.75, 0.0, 1.0)
+    return floor - 220.0 * knots + 8.0 * noise(dice, 256, 256)
+
+
+def tiles(dice: Dice) -> np.ndarray:
+    """Return a floor of 8 x 8 tiles of slightly different tone with dark joints."""
+    side = SIZE // 8
+    tone = np.where((np.add.outer(np.arange(8), np.arange(8)) % 2) == 0, 165.0,
+                    dice.between(100.0, 155.0)) + 26.0 * (dice.unit(8, 8) - 0.5)
+    floor = np.repeat(np.repeat(tone, side, axis=0), side, axis=1)
+    floor += 15.0 * fractal(dice, 16, 256, 0.8)
+    joint = np.arange(SIZE) % side < 3
+    floor[joint] = floor[:, joint] = 70.0
+    return floor
+
+
+def carpet(dice: Dice) -> np.ndarray:
+    """Return a patterned carpet: nested diamonds on a woven ground."""
+    y, x = np.mgrid[:SIZE, :SIZE]
+    step = SIZE // 4
+    ring = np.abs(x % step - step // 2) + np.abs(y % step - step // 2)
+    tones = 70.0 + 110.0 * dice.unit(16)
+    return tones[ring // 12] + 14.0 * noise(dice, 256, 256) + 14.0 * fractal(dice, 4, 64, 0.8)
+
+
+def poster(dice: Dice) -> np.ndarray:
+    """Return a framed print: shapes of all sizes and a few lines of text."""
+    sheet = np.full((SIZE, SIZE), dice.between(60.0, 220.0))
+    sheet += dice.between(10.0, 40.0) * fractal(dice, 2, 16, 0.7)
+    y, x = np.mgrid[:SIZE, :SIZE]
+    for _ in range(dice.integer(14, 40)):
+        row, column = dice.integer(0, SIZE), dice.integer(0, SIZE)
+        high, wide = dice.integer(12, 150), dice.integer(12, 150)
+        tone = dice.between(15.0, 240.0)
+        if dice.chance(0.6):
+            sheet[row:row + high, column:column + wide] = tone
+        else:
+            sheet[(x - column) ** 2 + (y - row) ** 2 < high * high // 4] = tone
+    _write_text(dice, sheet)
+    sheet += 8.0 * fractal(dice, 32, 256, 0.9)
+    sheet[:14] = sheet[-14:] = sheet[:, :14] = sheet[:, -14:] = dice.between(20.0, 230.0)
+    return sheet
+
+
+def _write_text(dice: Dice, sheet: np.ndarray) -> None:
+    """Print a block of words of three to nine letters on a pale field."""
+    top, left = dice.integer(30, SIZE // 2), dice.integer(30, SIZE // 2)
+    height, width = dice.integer(80, 200), dice.integer(120, 220)
+    sheet[top:top + height, left:left + width] = 215.0
+    for row in range(top + 10, top + height - 14, 20):
+        column = left + 10
+        while column < left + width - 60:
+            for _ in range(dice.integer(3, 9)):
+                sheet[row:row + dice.integer(7, 12), column:column + dice.integer(2, 5)] = 40.0
+                column += 6
+            column += 10
+
+
+def books(dice: Dice) -> np.ndarray:
+    """Return four shelves of books."""
+    shelf = SIZE // 4
+    case = np.full((SIZE, SIZE), 30.0)
+    for top in range(0, SIZE, shelf):
+        column = 8
+        while column < SIZE - 12:
+            wide, tall = dice.integer(9, 32), dice.integer(60, 112)
+            column_end, bottom = min(column + wide, SIZE - 8), top + shelf - 8
+            tone = dice.between(45.0, 225.0)
+            case[bottom - tall:bottom, column:column_end] = tone
+            band = bottom - dice.integer(20, tall)
+            case[band:band + dice.integer(4, 16), column:column_end] = dice.between(20.0, 240.0)
+            case[bottom - tall:bottom, column:column + 2] = 0.6 * tone
+            column = column_end + (dice.integer(10, 50) if dice.chance(0.08) else 0)
+        case[top + shelf - 8:top + shelf] = 130.0
+    case[:, :8] = case[:, -8:] = 130.0
+    return case + 6.0 * fractal(dice, 64, 256, 0.9)
+
+
+def door(dice: Dice) -> np.ndarray:
+    """Return a panelled door with a handle."""
+    leaf = np.full((SIZE, SIZE), dice.between(110.0, 190.0)) + 9.0 * noise(dice, 16, 256)
+    for top, bottom in ((40, 200), (235, 470)):
+        for left in (50, 280):
+            panel = leaf[top:bottom, left:left + 180]
+            panel -= 35.0
+            panel[8:-8, 8:-8] += 25.0
+            panel[:5] -= 30.0
+    leaf[240:262, 462:496] = 40.0
+    leaf[:10] = leaf[:, :14] = leaf[:, -14:] = 65.0
+    return leaf + 6.0 * fractal(dice, 32, 256, 0.9)
+
+
+def window(dice: Dice) -> np.ndarray:
+    """Return a bright window of six panes over a hazy street."""
+    view = np.repeat(np.linspace(235.0, 200.0, SIZE)[:, None], SIZE, axis=1)
+    for _ in range(14):
+        left, wide, tall = dice.integer(0, SIZE), dice.integer(40, 120), dice.integer(90, 330)
+        tone = dice.between(120.0, 195.0)
+        view[SIZE - tall:, left:left + wide] = tone
+        view[SIZE - tall + 12::24, left + 8:left + wide - 8] = tone - 25.0
+    view += 10.0 * fractal(dice, 16, 128, 0.8)
+    for bar in (0, SIZE // 3, 2 * SIZE // 3, SIZE - 16):
+        view[:, bar:bar + 16] = 165.0
+        view[:, bar + 14:bar + 16] = 90.0
+    for bar in (0, SIZE // 2, SIZE - 16):
+        view[bar:bar + 16] = 170.0
+        view[bar + 14:bar + 16] = 90.0
+    return view
+
+
+def cupboard(dice: Dice) -> np.ndarray:
+    """Return wooden doors and drawers with knobs."""
+    front = np.full((SIZE, SIZE), dice.between(80.0, 165.0))
+    front += 13.0 * noise(dice, 8, 128) + 10.0 * noise(dice, 16, 256)
+    for top, bottom, columns in ((0, 300, 2), (300, 406, 3), (406, SIZE, 3)):
+        wide = SIZE // columns
+        front[top:top + 5] = 40.0
+        for column in range(columns):
+            left = column * wide
+            front[top:bottom, left:left + 5] = 40.0
+            row = (top + bottom) // 2
+            knob = left + (wide // 2 if columns == 3 else (wide - 30 if column == 0 else 30))
+            front[row - 9:row + 9, knob - 9:knob + 9] = 215.0
+            front[row + 9:row + 13, knob - 9:knob + 9] = 35.0
+    return front + 6.0 * fractal(dice, 32, 256, 0.9)
+
+
+def cardboard(dice: Dice) -> np.ndarray:
+    """Return the side of a parcel: tape, a label, scuffs."""
+    side = 135.0 + 10.0 * noise(dice, 4, 256) + 12.0 * fractal(dice, 4, 128, 0.8)
+    tape = dice.integer(180, 300)
+    side[:, tape:tape + 60] += 30.0
+    row, column = dice.integer(40, 300), dice.integer(20, 320)
+    side[row:row + 130, column:column + 150] = 225.0
+    for line in range(row + 14, row + 116, 16):
+        side[line:line + 6, column + 12:column + dice.integer(60, 140)] = 45.0
+    stamp_row, stamp_column = dice.integer(0, 400), dice.integer(0, 400)
+    side[stamp_row:stamp_row + 60, stamp_column:stamp_column + 90] = 60.0
+    side[stamp_row + 10:stamp_row + 50, stamp_column + 10:stamp_column + 80] = 130.0
+    side[:4] = side[:, :4] = 60.0
+    return side
+
+
+Painter = Callable[[Dice], np.ndarray]

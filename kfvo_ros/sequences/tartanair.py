@@ -1,0 +1,69 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""TartanAir V1: .../P000 with image_left and pose_left.txt.
+
+Source: Wang et al., "TartanAir: a dataset to push the limits of visual SLAM", IROS 2020, and
+the data page of tartanair_tools.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from kfvo_ros import geometry
+from kfvo_ros.camera import Camera
+from kfvo_ros.errors import KfvoError
+from kfvo_ros.sequences.base import GroundTruth
+from kfvo_ros.sequences.calibration import Calibration
+from kfvo_ros.sequences.image_list import ImageListSequence, list_images, stamps_at_rate
+from kfvo_ros.sequences.kind import Kind, Options
+from kfvo_ros.sequences.text_rows import parse_floats, read_rows
+from kfvo_ros.trajectory import Trajectory
+
+CAMERA = Camera(640, 480, 320.0, 320.0, 320.0, 240.0)
+"""The one camera of the whole dataset."""
+
+R_NED_OPTICAL = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+"""The dataset's camera looks along x with z down; an optical frame along z with y down."""
+
+
+def open_tartanair(path: Path, options: Options) -> ImageListSequence:
+    """Open the left camera of a trajectory folder, stamped at the rate of the options."""
+    folder = path / 'image_left'
+    stamp_of = stamps_at_rate(options.rate)
+    images = [(stamp_of(index), name) for index, name in enumerate(list_images(folder))]
+    stamps_ns = np.array([stamp_ns for stamp_ns, _ in images], dtype=np.int64)
+    return ImageListSequence('/'.join(path.parts[-3:]), folder, images,
+                             Calibration(options.camera, path, lambda width, height: CAMERA),
+                             partial(_read_ground_truth, path / 'pose_left.txt', stamps_ns))
+
+
+def _matches(path: Path) -> bool:
+    return (path / 'image_left').is_dir() and (path / 'pose_left.txt').is_file()
+
+
+KIND = Kind('tartanair', 'TartanAir V1: .../P000 with image_left and pose_left.txt', _matches,
+            open_tartanair)
+
+
+def _read_ground_truth(path: Path, stamps_ns: np.ndarray) -> GroundTruth | None:
+    """Read poses of the NED camera and turn them to optical axes; the world stays NED."""
+    if not path.is_file():
+        return None
+    rows = read_rows(path, 'tx ty tz qx qy qz qw', _parse_pose)
+    if len(rows) != len(stamps_ns):
+        raise KfvoError(f'{path} holds {len(rows)} poses for {len(stamps_ns)} images; '
+                        'expected one line per image')
+    values = np.array(rows).reshape(-1, 7)
+    rotations = geometry.rotation_from_quat_xyzw(values[:, 3:]) @ R_NED_OPTICAL
+    return GroundTruth(Trajectory(stamps_ns, geometry.make_transform(rotations, values[:, :3])))
+
+
+def _parse_pose(line: str) -> list[float]:
+    values = parse_floats(line.split(), 7)
+    if not any(values[3:]):
+        raise ValueError('a quaternion of zeros')
+    return values

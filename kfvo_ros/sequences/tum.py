@@ -1,0 +1,57 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""TUM RGB-D: rgb.txt beside the images, groundtruth.txt, intrinsics by the Kinect that was used.
+
+Source: Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012;
+intrinsics of the dataset's page on calibration.
+"""
+
+from __future__ import annotations
+
+import re
+from functools import partial
+from pathlib import Path
+
+from kfvo_ros.camera import Camera
+from kfvo_ros.sequences.base import GroundTruth
+from kfvo_ros.sequences.calibration import Calibration
+from kfvo_ros.sequences.image_list import ImageListSequence
+from kfvo_ros.sequences.kind import Kind, Options
+from kfvo_ros.sequences.text_rows import read_rows
+from kfvo_ros.trajectory import parse_stamp_ns, read_tum
+
+FREIBURG = {
+    '1': Camera(640, 480, 517.306408, 516.469215, 318.643040, 255.313989, 'plumb_bob',
+                (0.262383, -0.953104, -0.005358, 0.002628, 1.163314)),
+    '2': Camera(640, 480, 520.908620, 521.007327, 325.141442, 249.701764, 'plumb_bob',
+                (0.231222, -0.784899, -0.003257, -0.000105, 0.917205)),
+    '3': Camera(640, 480, 535.4, 539.2, 320.1, 247.6),
+}
+"""The colour cameras of freiburg1, 2 and 3; the third's images are rectified."""
+
+
+def open_tum(path: Path, options: Options) -> ImageListSequence:
+    """Open the colour camera of a sequence folder."""
+    images = read_rows(path / 'rgb.txt', 'timestamp filename', _parse_image)
+    return ImageListSequence(path.name, path, images,
+                             Calibration(options.camera, path, partial(_camera_of, path.name)),
+                             partial(_read_ground_truth, path / 'groundtruth.txt'))
+
+
+KIND = Kind('tum', 'TUM RGB-D: a folder with rgb.txt', lambda path: (path / 'rgb.txt').is_file(),
+            open_tum)
+
+
+def _parse_image(line: str) -> tuple[int, str]:
+    stamp, file_name = line.split(maxsplit=1)
+    return parse_stamp_ns(stamp), file_name
+
+
+def _camera_of(name: str, width: int, height: int) -> Camera | None:
+    found = re.search(r'(?:^|_)(?:freiburg|fr)([123])(?:_|$)', name)
+    return FREIBURG[found[1]] if found else None
+
+
+def _read_ground_truth(path: Path) -> GroundTruth | None:
+    """Read the poses of the colour camera's optical frame, which is what the file holds."""
+    return GroundTruth(read_tum(path)) if path.is_file() else None

@@ -1,0 +1,73 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""A video file, calibrated by a camera_info.yaml beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import cv2
+
+from kfvo_ros.errors import KfvoError
+from kfvo_ros.sequences.base import Frame, Sequence
+from kfvo_ros.sequences.calibration import Calibration
+from kfvo_ros.sequences.image_list import stamps_at_rate
+from kfvo_ros.sequences.kind import Kind, Options
+
+VIDEO_SUFFIXES = frozenset(('.mp4', '.m4v', '.avi', '.mov', '.mkv', '.webm', '.mpg', '.mpeg'))
+
+
+class VideoSequence(Sequence):
+    """The frames of a video, stamped from zero at the rate that its container states.
+
+    Where it states none, `rate` [Hz] holds. `length` is the container's word, not a count.
+    """
+
+    def __init__(self, path: Path, calibration: Calibration, rate: float) -> None:
+        self.name = path.stem
+        self._path = path
+        with _opened(path) as capture:
+            self._length = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+            stated_rate = capture.get(cv2.CAP_PROP_FPS)
+            readable, image = capture.read()
+        if not readable:
+            raise KfvoError(f'{path}: expected a video, not one frame of it can be decoded')
+        self._stamp_of = stamps_at_rate(stated_rate if stated_rate > 0 else rate)
+        self.camera = calibration.camera(self.name, image.shape[1], image.shape[0])
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Yield the frames up to the first that cannot be decoded: that is how videos end."""
+        with _opened(self._path) as capture:
+            index = 0
+            while (read := capture.read())[0]:
+                image = cv2.cvtColor(read[1], cv2.COLOR_BGR2RGB)
+                yield Frame(self._stamp_of(index), image, self.camera)
+                index += 1
+
+    @property
+    def length(self) -> int | None:
+        """Number of frames as the container states it, None where it does not."""
+        return self._length if self._length > 0 else None
+
+
+def open_video(path: Path, options: Options) -> VideoSequence:
+    """Open a video file."""
+    return VideoSequence(path, Calibration(options.camera, path.parent), options.rate)
+
+
+KIND = Kind('video', f'a video file ({" ".join(sorted(VIDEO_SUFFIXES))})',
+            lambda path: path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES, open_video)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[cv2.VideoCapture]:
+    capture = cv2.VideoCapture(str(path))
+    try:
+        if not capture.isOpened():
+            raise KfvoError(f'cannot open the video {path}: expected a format that this OpenCV '
+                            'can decode; convert it, or extract its images into a folder')
+        yield capture
+    finally:
+        capture.release()

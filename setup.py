@@ -1,0 +1,60 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Install kfvo_ros, by pip or as an ament_python package by colcon."""
+
+from glob import glob
+
+from setuptools import find_packages, setup
+
+NAME = 'kfvo_ros'
+INSTALLED_FOLDERS = ('config', 'launch', 'rviz', 'foxglove')
+
+setup(
+    name=NAME,
+    version='0.1.0',
+    description='Keyframe-based feed-forward visual odometry for ROS 2',
+    license='Apache-2.0',
+    maintainer='The kfvo_ros authors',
+    maintainer_email='maintainers@kfvo-ros.example',
+    packages=find_packages(include=[NAME, f'{NAME}.*']),
+    data_files=[
+        ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
+        (f'share/{NAME}', ['package.xml']),
+        *((f'share/{NAME}/{folder}', glob(f'{folder}/*')) for folder in INSTALLED_FOLDERS),
+    ],
+    python_requires='>=3.10',
+    install_requires=[
+        'mcap>=1.0',
+        'numba>=0.58',
+        'numpy>=1.26',
+        'opencv-python-headless>=4.6',
+        'poselib>=2.0.4',
+        'PyYAML>=6.0',
+        'rosbags>=0.11',
+        'threadpoolctl>=3.1',
+        'tqdm>=4.60',
+    ],
+    extras_require={
+        # ROS 2 Jazzy as wheels (Linux x86-64 only), for machines without /opt/ros. The
+        # ros-jazzy-* names choose the distribution, the exact versions keep pip from the next.
+        'ros': [
+            'ros-jazzy-rclpy',
+            'ros-jazzy-common-interfaces',
+            'ros-rclpy[fastrtps]==7.1.6',
+            'ros-common-interfaces==5.3.6',
+        ],
+        'vggt': ['torch>=2.3', 'safetensors>=0.4', 'huggingface_hub>=0.23', 'pillow>=9.0'],
+        'train': ['stable-baselines3>=2.4', 'gymnasium>=0.29.1', 'tensorboard>=2.9'],
+        'test': ['colcon-common-extensions', 'evo>=1.31', 'mypy', 'pytest>=7.0', 'ruff'],
+    },
+    entry_points={
+        'console_scripts': [
+            'kfvo_run = kfvo_ros.run:main',
+            'kfvo_node = kfvo_ros.commands:not_in_this_version',
+            'kfvo_convert = kfvo_ros.commands:not_in_this_version',
+            'kfvo_play = kfvo_ros.commands:not_in_this_version',
+            'kfvo_train = kfvo_ros.commands:not_in_this_version',
+            'kfvo_benchmark = kfvo_ros.commands:not_in_this_version',
+        ],
+    },
+)

@@ -1,0 +1,25 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What several tests share."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture(scope='session')
+def data_path() -> Callable[[str], Path]:
+    """Return a function from a path below KFVO_DATA to the file or folder, or a skip."""
+    def find(relative: str) -> Path:
+        root = os.environ.get('KFVO_DATA')
+        if not root:
+            pytest.skip('KFVO_DATA names no folder of sequences')
+        path = Path(root, relative)
+        if not path.exists():
+            pytest.skip(f'no {relative} in KFVO_DATA')
+        return path
+    return find

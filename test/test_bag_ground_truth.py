@@ -1,0 +1,212 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Ground truth in bags: every type of message, which one is taken, and how it is moved."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+import pytest
+from bag_writers import (
+    COUNT,
+    EASY,
+    POSES,
+    STAMPS_NS,
+    START_NS,
+    STORAGES,
+    BagWriter,
+    Records,
+    images,
+    open_bag,
+    truth_records,
+)
+from sequence_writers import make_poses
+
+from kfvo_ros import geometry
+from kfvo_ros.errors import KfvoError
+from kfvo_ros.sequences import open_sequence
+from kfvo_ros.sequences.base import GroundTruth
+
+T_BODY_CAMERA, T_BODY_MOUNT, T_MOUNT_CAMERA = (make_poses(1, seed)[0] for seed in (7, 8, 9))
+
+every_storage = pytest.mark.parametrize('storage', STORAGES)
+
+
+def check(truth: GroundTruth, frame: str, poses: np.ndarray) -> None:
+    assert truth.frame == frame and truth.trajectory.has_rotation
+    assert truth.trajectory.stamps_ns.tolist() == STAMPS_NS
+    np.testing.assert_allclose(truth.trajectory.poses, poses, atol=1e-12)
+
+
+@pytest.mark.parametrize(('kind', 'frame'), [
+    ('odometry', 'body'), ('pose_stamped', '/truth'), ('pose_with_covariance_stamped', '/truth'),
+    ('transform', 'body')])
+@every_storage
+def test_pose_topics(storage, kind, frame, tmp_path):
+    """A pose is of the frame its message names, until something says where the camera is."""
+    writer = BagWriter(storage)
+    sequence = open_bag(writer, tmp_path, images(writer),
+                        truth_records(writer, '/truth', getattr(writer, kind)))
+    check(sequence.ground_truth(), frame, POSES)
+    moved = open_sequence(str(sequence._path), camera=EASY, ground_truth_to_camera=T_BODY_CAMERA)
+    check(moved.ground_truth(), 'camera', POSES @ T_BODY_CAMERA)
+
+
+@every_storage
+def test_points_have_no_rotation_and_cannot_be_moved(storage, tmp_path):
+    writer = BagWriter(storage)
+    sequence = open_bag(writer, tmp_path, images(writer),
+                        truth_records(writer, '/leica/position', writer.point_stamped),
+                        ground_truth_to_camera=T_BODY_CAMERA)
+    truth = sequence.ground_truth()
+    assert truth.frame == '/leica/position' and not truth.trajectory.has_rotation
+    assert truth.trajectory.stamps_ns.tolist() == STAMPS_NS
+    np.testing.assert_array_equal(truth.trajectory.positions, POSES[:, :3, 3])
+
+
+def static_chain(writer: BagWriter) -> Records:
+    """Return body -> mount -> camera on /tf_static, and a frame that hangs elsewhere."""
+    still = [writer.transform(START_NS, T_BODY_MOUNT, 'mount', 'body'),
+             writer.transform(START_NS, T_MOUNT_CAMERA, 'camera', 'mount'),
+             writer.transform(START_NS, np.eye(4), 'tool', 'arm')]
+    return [('/tf_static', START_NS, writer.transforms(*still))]
+
+
+@pytest.mark.parametrize('kind', ['odometry', 'transform'])
+@every_storage
+def test_truth_is_moved_by_static_transforms(storage, kind, tmp_path):
+    writer = BagWriter(storage)
+    truth = truth_records(writer, '/truth', getattr(writer, kind))
+    sequence = open_bag(writer, tmp_path, images(writer), truth, static_chain(writer))
+    check(sequence.ground_truth(), 'camera', POSES @ T_BODY_MOUNT @ T_MOUNT_CAMERA)
+    explicit = open_sequence(str(sequence._path), camera=EASY,
+                             ground_truth_to_camera=T_BODY_CAMERA)
+    check(explicit.ground_truth(), 'camera', POSES @ T_BODY_CAMERA)
+
+
+def test_the_camera_may_be_the_parent_of_the_measured_frame(tmp_path):
+    writer = BagWriter('mcap')
+    marker = writer.transform(START_NS, geometry.invert(T_BODY_CAMERA), 'body', 'camera')
+    sequence = open_bag(writer, tmp_path, images(writer),
+                        truth_records(writer, '/truth', writer.odometry),
+                        [('/tf_static', START_NS, writer.transforms(marker))])
+    check(sequence.ground_truth(), 'camera', POSES @ T_BODY_CAMERA)
+
+
+def test_a_chain_that_does_not_reach_the_camera(tmp_path):
+    writer = BagWriter('mcap')
+    loop = [writer.transform(START_NS, np.eye(4), *pair)
+            for pair in (('body', 'mount'), ('mount', 'body'), ('camera', 'tripod'))]
+    loop.append(writer.transform(START_NS, np.eye(4), 'camera', 'body'))
+    loop[-1].transform.rotation.w = 0.0  # no rotation at all: as if it were not there
+    sequence = open_bag(writer, tmp_path, images(writer),
+                        truth_records(writer, '/truth', writer.odometry),
+                        [('/tf_static', START_NS, writer.transforms(*loop))])
+    check(sequence.ground_truth(), 'body', POSES)
+
+
+def test_a_camera_that_turns_on_the_body_is_not_fixed_to_it(tmp_path):
+    writer = BagWriter('mcap')
+    turning = [('/tf', stamp, writer.transforms(writer.transform(stamp, pose, 'camera', 'body')))
+               for stamp, pose in zip(STAMPS_NS, make_poses(COUNT, 5))]
+    sequence = open_bag(writer, tmp_path, images(writer), turning,
+                        truth_records(writer, '/truth', writer.odometry))
+    check(sequence.ground_truth(), 'body', POSES)
+
+
+def test_truth_of_the_camera_itself_needs_no_transform(tmp_path):
+    writer = BagWriter('mcap')
+    truth = [(topic, stamp, writer.odometry(message.header.stamp.sec * 10 ** 9 +
+                                            message.header.stamp.nanosec, pose, 'camera'))
+             for (topic, stamp, message), pose in zip(
+                 truth_records(writer, '/truth', writer.odometry), POSES)]
+    check(open_bag(writer, tmp_path, images(writer), truth).ground_truth(), 'camera', POSES)
+
+
+@pytest.mark.parametrize(('storage', 'kind'), [
+    ('ros1', 'tf/tfMessage'), ('ros1', 'tf2_msgs/TFMessage'), ('sqlite3', 'tf2_msgs/TFMessage'),
+    ('mcap', 'tf2_msgs/TFMessage')])
+def test_transforms_as_in_the_bags_of_tum(storage, kind, tmp_path):
+    """The world moves to the kinect; fixed transforms come again and again beside it on /tf."""
+    writer = BagWriter(storage)
+    slash = '/' if writer.is_ros1 else ''
+    records = []
+    for stamp, pose in zip(STAMPS_NS, POSES):
+        fixed = [writer.transform(stamp + 7, T_BODY_MOUNT, f'{slash}mount', f'{slash}kinect'),
+                 writer.transform(stamp + 7, T_MOUNT_CAMERA, f'{slash}camera', f'{slash}mount')]
+        moving = [writer.transform(stamp, pose, f'{slash}kinect', f'{slash}world'),
+                  writer.transform(stamp + 9, pose @ pose, f'{slash}hand', f'{slash}arm')]
+        records += [('/tf', stamp + 7, writer.transforms(*fixed, kind=kind)),
+                    ('/tf', stamp + 9, writer.transforms(*moving, kind=kind))]
+    sequence = open_bag(writer, tmp_path, images(writer, frame_id=f'{slash}camera'), records)
+    check(sequence.ground_truth(), 'camera', POSES @ T_BODY_MOUNT @ T_MOUNT_CAMERA)
+
+
+def test_transforms_that_do_not_reach_the_camera_name_their_frame(tmp_path):
+    writer = BagWriter('mcap')
+    records = truth_records(writer, '/tf', lambda stamp, pose: writer.transforms(
+        writer.transform(stamp, pose, 'kinect')))
+    check(open_bag(writer, tmp_path, images(writer), records).ground_truth(), 'kinect', POSES)
+
+
+def test_transforms_that_stand_still_are_no_truth(tmp_path):
+    writer = BagWriter('mcap')
+    records = truth_records(writer, '/tf', lambda stamp, pose: writer.transforms(
+        writer.transform(stamp, T_BODY_MOUNT)))
+    assert open_bag(writer, tmp_path, images(writer), records).ground_truth() is None
+    asked = open_sequence(str(tmp_path / 'walk'), camera=EASY, ground_truth_topic='/tf')
+    with pytest.raises(KfvoError, match='expected a moving transform on /tf, found none'):
+        asked.ground_truth()
+
+
+def test_ground_truth_topics(tmp_path, caplog):
+    """By type, then by name; or the one that is asked for."""
+    caplog.set_level(logging.INFO)
+    writer = BagWriter('mcap')
+    others = {'/a/point': writer.point_stamped, '/b/transform': writer.transform,
+              '/d/odometry': writer.odometry, '/c/odometry': writer.odometry,
+              '/e/pose': writer.pose_stamped}
+    sequence = open_bag(writer, tmp_path, images(writer), static_chain(writer), *(
+        truth_records(writer, topic, make, make_poses(COUNT, seed))
+        for seed, (topic, make) in enumerate(others.items())))
+    moved = make_poses(COUNT, 3) @ T_BODY_MOUNT @ T_MOUNT_CAMERA
+    check(sequence.ground_truth(), 'camera', moved)
+    choice = next(record.message for record in caplog.records if 'candidates' in record.message)
+    assert '/c/odometry is taken' in choice
+    assert choice.endswith('other candidates: /d/odometry, /e/pose, /b/transform, /a/point')
+    bag = str(tmp_path / 'walk')
+    asked = open_sequence(bag, camera=EASY, ground_truth_topic='e/pose')
+    check(asked.ground_truth(), '/e/pose', make_poses(COUNT, 4))
+    wrong = open_sequence(bag, camera=EASY, ground_truth_topic='/cam0/image_raw')
+    with pytest.raises(KfvoError, match='/cam0/image_raw holds no poses.*these do: /a/point'):
+        wrong.ground_truth()
+
+
+def test_lost_moments_of_motion_capture_are_left_out(tmp_path):
+    writer = BagWriter('mcap')
+    records = truth_records(writer, '/truth', writer.pose_stamped)
+    records[1][2].pose.position.x = float('nan')
+    orientation = records[3][2].pose.orientation
+    orientation.x = orientation.y = orientation.z = orientation.w = 0.0
+    truth = open_bag(writer, tmp_path, images(writer), records).ground_truth()
+    assert truth.trajectory.stamps_ns.tolist() == [STAMPS_NS[index] for index in (0, 2, 4)]
+    np.testing.assert_allclose(truth.trajectory.poses, POSES[[0, 2, 4]], atol=1e-12)
+
+
+def test_a_motion_capture_that_never_saw_the_body(tmp_path):
+    writer = BagWriter('mcap')
+    records = truth_records(writer, '/truth', writer.pose_stamped)
+    for _, _, message in records:
+        message.pose.position.x = float('nan')
+    assert open_bag(writer, tmp_path, images(writer), records).ground_truth() is None
+    asked = open_sequence(str(tmp_path / 'walk'), camera=EASY, ground_truth_topic='/truth')
+    with pytest.raises(KfvoError, match='expected a pose.* on /truth, found none'):
+        asked.ground_truth()
+
+
+@pytest.mark.parametrize('matrix', [2 * np.eye(4), np.diag([1.0, 1, -1, 1]), np.eye(3), 'x'])
+def test_a_transform_that_is_not_rigid_is_refused(matrix, tmp_path):
+    writer = BagWriter('mcap')
+    with pytest.raises(KfvoError, match='ground truth to camera.*expected a rigid 4x4'):
+        open_bag(writer, tmp_path, images(writer), ground_truth_to_camera=matrix)

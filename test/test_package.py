@@ -1,0 +1,244 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The package around the code: what is installed, what is declared, and who imports whom."""
+
+from __future__ import annotations
+
+import ast
+import importlib.metadata
+import importlib.util
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+import kfvo_ros
+from kfvo_ros.camera import read_camera_info
+from kfvo_ros.errors import KfvoError
+from kfvo_ros.requirements import PIP_NAMES, missing_dependency
+
+ROOT = Path(__file__).resolve().parent.parent
+SOURCES = sorted((ROOT / 'kfvo_ros').rglob('*.py'))
+COMMANDS = {'kfvo_node', 'kfvo_run', 'kfvo_convert', 'kfvo_play', 'kfvo_train', 'kfvo_benchmark'}
+HEADER = ['# Copyright 2026 The kfvo_ros authors', '# SPDX-License-Identifier: Apache-2.0']
+BUILT = ('.git', '.venv*', '*.egg-info', '__pycache__', '.*_cache', 'build', 'install', 'log',
+         'demo')
+
+# Rooms by floor, the ground first; modules that are not named stand on the ground.
+FLOORS = ((), ('sequences',), ('backbones',), ('keyframes',), ('knowledge', 'odometry', 'scale'),
+          ('commands', 'run'))
+HEAVY = ('rclpy', 'torch', 'scipy', 'stable_baselines3')
+MAY_BE_HEAVY = ('kfvo_ros.ros', 'kfvo_ros.learning', 'kfvo_ros.backbones.vggt')
+
+
+def module_name(path: Path) -> str:
+    """Return the dotted name of a source file."""
+    parts = path.relative_to(ROOT).with_suffix('').parts
+    return '.'.join(parts[:-1] if parts[-1] == '__init__' else parts)
+
+
+def imported_modules(path: Path) -> Iterator[str]:
+    """Yield all that a file imports, at its top or inside functions, as dotted names."""
+    for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f'{path}: relative import'
+            yield from (f'{node.module}.{alias.name}' for alias in node.names)
+
+
+def floor_of(module: str) -> int:
+    """Return the floor of ``kfvo_ros`` or ``kfvo_ros.room...``."""
+    room = module.partition('.')[2].partition('.')[0]
+    return next((floor for floor, rooms in enumerate(FLOORS) if room in rooms), 0)
+
+
+def run_python(code: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run code in a fresh interpreter that sees the package."""
+    environment = {**os.environ, 'PYTHONPATH': str(ROOT)}
+    return subprocess.run([sys.executable, '-c', code, *arguments], env=environment, text=True,
+                          capture_output=True, timeout=120, check=False)
+
+
+# Who imports whom
+
+
+def test_imports_point_down_only() -> None:
+    wrong = [f'{module_name(path)} imports {imported}' for path in SOURCES
+             for imported in imported_modules(path)
+             if imported.startswith('kfvo_ros.')
+             and floor_of(imported) > floor_of(module_name(path))]
+    assert not wrong
+
+
+def test_only_the_ros_folder_imports_rclpy() -> None:
+    importing = [module_name(path) for path in SOURCES for imported in imported_modules(path)
+                 if imported.split('.')[0] == 'rclpy']
+    assert all(name.startswith('kfvo_ros.ros') for name in importing), importing
+
+
+def test_core_imports_without_ros_torch_and_scipy() -> None:
+    core = [name for name in map(module_name, SOURCES) if not name.startswith(MAY_BE_HEAVY)]
+    assert 'kfvo_ros.camera' in core
+    code = ('import importlib, sys\n'
+            f'sys.modules.update(dict.fromkeys({HEAVY}))\n'
+            'for name in sys.argv[1:]: importlib.import_module(name)')
+    outcome = run_python(code, *core)
+    assert outcome.returncode == 0, outcome.stderr
+
+
+# A missing dependency
+
+
+@pytest.mark.parametrize('module', sorted(PIP_NAMES))
+def test_missing_module_names_its_pip_line(module: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(ModuleNotFoundError) as caught:
+        importlib.import_module(module)
+    problem = missing_dependency(caught.value)
+    assert isinstance(problem, KfvoError)
+    assert str(problem) == f'{module} is missing: pip install {PIP_NAMES[module]}'
+
+
+def test_missing_module_of_ours_stays_an_error() -> None:
+    with pytest.raises(ModuleNotFoundError) as caught:
+        importlib.import_module('kfvo_ros.no_such_module')
+    with pytest.raises(ModuleNotFoundError, match='no_such_module'):
+        missing_dependency(caught.value)
+
+
+@pytest.mark.parametrize('module', ['numpy', 'poselib'])
+def test_run_names_a_missing_package(module: str, tmp_path: Path) -> None:
+    code = ('import sys\n'
+            f'sys.modules[{module!r}] = None\n'
+            'from kfvo_ros.run import main\n'
+            'sys.exit(main(["synthetic:0", "--stop", "2", "--output", sys.argv[1]]))')
+    outcome = run_python(code, str(tmp_path))
+    assert outcome.returncode == 1
+    assert f'{module} is missing: pip install {module}' in outcome.stderr
+    assert 'Traceback' not in outcome.stderr
+
+
+# What colcon installs
+
+
+@pytest.fixture(scope='module')
+def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a workspace in which colcon built a copy of this source tree."""
+    if importlib.util.find_spec('colcon') is None:
+        pytest.skip('colcon is not installed: pip install colcon-common-extensions')
+    folder = tmp_path_factory.mktemp('workspace')
+    source = folder / 'src' / 'kfvo_ros'
+    shutil.copytree(ROOT, source, ignore=shutil.ignore_patterns(*BUILT))
+    # One file in each folder that setup.py installs, whether it holds something yet or not.
+    for name in ('config', 'launch', 'rviz', 'foxglove'):
+        (source / name).mkdir(exist_ok=True)
+        (source / name / 'probe').touch()
+    outcome = subprocess.run([sys.executable, '-m', 'colcon', 'build'], cwd=folder, text=True,
+                             env={**os.environ, 'COLCON_HOME': str(folder)}, timeout=300,
+                             capture_output=True, check=False)
+    assert outcome.returncode == 0, outcome.stdout + outcome.stderr
+    return folder
+
+
+@pytest.fixture(scope='module')
+def distribution(workspace: Path) -> importlib.metadata.Distribution:
+    """Return what setup.py declares, as it was installed."""
+    site_packages = next(workspace.glob('install/kfvo_ros/lib/python3*/site-packages'))
+    return next(iter(importlib.metadata.distributions(name='kfvo_ros', path=[str(site_packages)])))
+
+
+def start(workspace: Path, command: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run an installed script as `ros2 run` does, after sourcing the workspace."""
+    script = workspace / 'install' / 'kfvo_ros' / 'lib' / 'kfvo_ros' / command
+    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ['PATH']])
+    return subprocess.run(['sh', '-c', '. install/local_setup.sh && exec "$0" "$@"', str(script),
+                           *arguments], cwd=workspace, env={**os.environ, 'PATH': path},
+                          text=True, capture_output=True, timeout=120, check=False)
+
+
+def test_declarations_agree(distribution: importlib.metadata.Distribution) -> None:
+    manifest = ElementTree.parse(ROOT / 'package.xml').getroot()
+    declared = distribution.metadata
+    assert manifest.findtext('name') == declared['Name'].replace('-', '_') == 'kfvo_ros'
+    assert manifest.findtext('version') == distribution.version == kfvo_ros.__version__
+    assert manifest.findtext('description') == declared['Summary']
+    assert manifest.findtext('license') == 'Apache-2.0'
+    assert 'Apache-2.0' in (declared.get('License'), declared.get('License-Expression'))
+    assert manifest.findtext('export/build_type') == 'ament_python'
+    assert f'## {kfvo_ros.__version__}' in (ROOT / 'CHANGELOG.md').read_text(encoding='utf-8')
+
+
+def test_every_requirement_has_a_pip_line_and_a_pin(
+        distribution: importlib.metadata.Distribution) -> None:
+    requires = distribution.requires or []
+    needed = {re.match(r'[\w.-]+', line)[0] for line in requires if 'extra ==' not in line}
+    assert needed == set(PIP_NAMES.values())
+    named = {re.sub(r'[-_.]+', '-', re.match(r'[\w.-]+', line)[0]).lower() for line in requires}
+    for file in ('constraints.txt', 'constraints-jazzy.txt'):
+        pins = set(re.findall(r'^([\w.-]+)==', (ROOT / file).read_text(), re.MULTILINE))
+        assert named <= pins, f'{file} lacks {named - pins}'
+
+
+def test_installed_files(workspace: Path) -> None:
+    installed = workspace / 'install' / 'kfvo_ros'
+    share = installed / 'share' / 'kfvo_ros'
+    assert (installed / 'share/ament_index/resource_index/packages/kfvo_ros').is_file()
+    assert (share / 'package.xml').is_file()
+    for folder in ('config', 'launch', 'rviz', 'foxglove'):
+        assert (share / folder / 'probe').is_file()
+    scripts = {path.name: path for path in (installed / 'lib' / 'kfvo_ros').iterdir()}
+    assert set(scripts) == COMMANDS
+    for script in scripts.values():
+        assert script.read_text().startswith('#!/usr/bin/env python3\n')
+        assert os.access(script, os.X_OK)
+
+
+def test_installed_command_starts(workspace: Path) -> None:
+    outcome = start(workspace, 'kfvo_run', '--help')
+    assert outcome.returncode == 0, outcome.stderr
+    assert 'SEQUENCE' in outcome.stdout
+
+
+@pytest.mark.parametrize('command', sorted(COMMANDS - {'kfvo_run'}))
+def test_command_to_come_says_so(workspace: Path, command: str) -> None:
+    outcome = start(workspace, command)
+    assert outcome.returncode == 1
+    assert outcome.stderr == (f'{command} is not part of kfvo_ros {kfvo_ros.__version__}; '
+                              'kfvo_run is: try kfvo_run --help\n')
+
+
+# Files
+
+
+@pytest.mark.parametrize('path', [ROOT / 'setup.py', *SOURCES, *(ROOT / 'test').rglob('*.py'),
+                                  *(ROOT / 'launch').rglob('*.py')],
+                         ids=lambda path: str(path.relative_to(ROOT)))
+def test_licence_header(path: Path) -> None:
+    lines = path.read_text(encoding='utf-8').splitlines()
+    assert not lines or lines[:2] == HEADER
+
+
+def test_camera_of_the_euroc_bags() -> None:
+    camera = read_camera_info(ROOT / 'config' / 'euroc_cam0.yaml')
+    assert (camera.width, camera.height) == (752, 480)
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (458.654, 457.296, 367.215, 248.375)
+    assert camera.distortion[:4] == (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05)
+
+
+def test_ros_wheels_make_messages() -> None:
+    if importlib.util.find_spec('rclpy') is None:
+        pytest.skip("rclpy is not installed: source a ROS 2 or pip install '.[ros]'")
+    outcome = run_python('import rclpy\n'
+                         'from nav_msgs.msg import Odometry, Path\n'
+                         'from rclpy.serialization import deserialize_message, serialize_message\n'
+                         'message = Odometry(child_frame_id="camera_body")\n'
+                         'again = deserialize_message(serialize_message(message), Odometry)\n'
+                         'assert again == message')
+    assert outcome.returncode == 0, outcome.stderr
