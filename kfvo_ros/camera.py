@@ -37,6 +37,8 @@ class Camera:
 
     Pixel centres are at whole coordinates. ``distortion`` is in OpenCV's order (k1 k2 p1 p2 k3
     ...; equidistant: k1 k2 k3 k4). ``guessed`` marks intrinsics nobody measured.
+    ``readout_s`` is the time from the first row of a rolling shutter to the last [s], zero for a
+    global shutter.
     """
 
     width: int
@@ -48,6 +50,7 @@ class Camera:
     distortion_model: str = 'none'
     distortion: tuple[float, ...] = ()
     guessed: bool = False
+    readout_s: float = 0.0
 
     def __post_init__(self) -> None:
         model = MODEL_SYNONYMS.get(self.distortion_model.strip().lower())

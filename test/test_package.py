@@ -32,7 +32,7 @@ BUILT = ('.git', '.venv*', '*.egg-info', '__pycache__', '.*_cache', 'build', 'in
 
 # Rooms by floor, the ground first; modules that are not named stand on the ground.
 FLOORS = ((), ('sequences',), ('backbones',), ('keyframes',), ('knowledge', 'odometry', 'scale'),
-          ('commands', 'run'))
+          ('assembly', 'options', 'results'), ('commands', 'run'))
 HEAVY = ('rclpy', 'torch', 'scipy', 'stable_baselines3')
 MAY_BE_HEAVY = ('kfvo_ros.ros', 'kfvo_ros.learning', 'kfvo_ros.backbones.vggt')
 
@@ -203,7 +203,7 @@ def test_installed_files(workspace: Path) -> None:
 def test_installed_command_starts(workspace: Path) -> None:
     outcome = start(workspace, 'kfvo_run', '--help')
     assert outcome.returncode == 0, outcome.stderr
-    assert 'SEQUENCE' in outcome.stdout
+    assert 'synthetic:SEED' in outcome.stdout
 
 
 @pytest.mark.parametrize('command', sorted(COMMANDS - {'kfvo_run'}))

@@ -20,12 +20,17 @@ from kfvo_ros.sequences.kind import Kind, Options
 from kfvo_ros.sequences.text_rows import read_rows
 from kfvo_ros.trajectory import parse_stamp_ns, read_tum
 
+KINECT_READOUT = 0.030
+"""The colour sensor is read row by row over nearly the whole interval of 33 ms (Ringaby and
+Forssen, "Scan rectification for structured light range sensors with rolling shutters", ICCV
+2011)."""
+
 FREIBURG = {
     '1': Camera(640, 480, 517.306408, 516.469215, 318.643040, 255.313989, 'plumb_bob',
-                (0.262383, -0.953104, -0.005358, 0.002628, 1.163314)),
+                (0.262383, -0.953104, -0.005358, 0.002628, 1.163314), readout_s=KINECT_READOUT),
     '2': Camera(640, 480, 520.908620, 521.007327, 325.141442, 249.701764, 'plumb_bob',
-                (0.231222, -0.784899, -0.003257, -0.000105, 0.917205)),
-    '3': Camera(640, 480, 535.4, 539.2, 320.1, 247.6),
+                (0.231222, -0.784899, -0.003257, -0.000105, 0.917205), readout_s=KINECT_READOUT),
+    '3': Camera(640, 480, 535.4, 539.2, 320.1, 247.6, readout_s=KINECT_READOUT),
 }
 """The colour cameras of freiburg1, 2 and 3; the third's images are rectified."""
 

@@ -14,6 +14,7 @@ from kfvo_ros.backbones.base import Backbone, Encoded, Estimate, Status, Stream,
 from kfvo_ros.backbones.geometric.initialisation import Initialiser
 from kfvo_ros.backbones.geometric.memory import Memory, recall
 from kfvo_ros.backbones.geometric.observations import View, tabulate
+from kfvo_ros.backbones.geometric.rolling_shutter import RollingShutter
 from kfvo_ros.backbones.geometric.signals import SIGNAL_NAMES, measure_motion, signals
 from kfvo_ros.backbones.geometric.window import solve
 from kfvo_ros.camera import Camera
@@ -38,6 +39,7 @@ class GeometricStream(Stream):
         self.camera = camera
         self.initialiser = Initialiser(0.5 * (camera.fx + camera.fy), seed)
         self._tracker = Tracker(camera, seed=seed)
+        self._shutter = RollingShutter(camera)
         self._count = 0
 
     def encode(self, frame: Frame) -> Encoded:
@@ -47,7 +49,7 @@ class GeometricStream(Stream):
             raise KfvoError(f'the calibration is for {self.camera.width}x{self.camera.height} '
                             f'images, {grey.shape[1]}x{grey.shape[0]} came')
         tracks = self._tracker.track(grey)
-        points = self.camera.undistort(tracks.pixels)
+        points = self.camera.undistort(self._shutter.correct(frame.stamp_ns, tracks))
         usable = np.isfinite(points).all(axis=1)
         view = View(self._count, tracks.select(usable), points[usable])
         self._count += 1

@@ -38,6 +38,7 @@ class Guess:
 
     state: State
     expected_inverse_depths: np.ndarray
+    new: np.ndarray = True
 
 
 class Initialiser:
@@ -72,7 +73,7 @@ class Initialiser:
         unknown = np.full(len(observations), np.nan)
         state = self._complete(observations, T_anchor_frame, unknown)
         state = state.scaled(float(np.median(state.inverse_depths)))
-        return Guess(state, np.ones(len(observations)))
+        return Guess(state, np.ones(len(observations)), np.ones(len(observations),bool))
 
     def from_previous(self, observations: Observations, previous: Previous,
                       history: History) -> Guess:
@@ -86,7 +87,7 @@ class Initialiser:
             len(T_anchor_frame) - 1, previous.T_anchor_latest)
         state = self._complete(observations, T_anchor_frame, known)
         median = np.median(known[is_known]) if is_known.any() else np.median(state.inverse_depths)
-        return Guess(state, np.where(is_known, known, median))
+        return Guess(state, np.where(is_known, known, median), ~is_known)
 
     def _best_pair(self, observations: Observations) -> tuple[int, int] | None:
         """Return the two frames whose relative pose is best determined."""

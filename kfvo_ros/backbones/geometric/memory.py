@@ -49,8 +49,17 @@ def recall(previous: Previous | None, anchor: View) -> History:
     if anchor.index not in indices:
         return History()
     position = indices.index(anchor.index)
-    start = max(0, position - HISTORY)
-    T_anchor_view = geometry.relative(memory.T_anchor_view[position],
-                                      memory.T_anchor_view[start:position])
+    keep=[]
+    for i in range(position):
+        if not keep or spaced(memory.views[keep[-1]],memory.views[i]): keep.append(i)
+    keep=keep[-HISTORY:]
+    if not keep: return History()
+    T_anchor_view = geometry.relative(memory.T_anchor_view[position], memory.T_anchor_view[keep])
     T_anchor_view[:, :3, 3] *= previous.memory_scale
-    return History(memory.views[start:position], T_anchor_view)
+    return History(tuple(memory.views[i] for i in keep), T_anchor_view)
+import os
+from kfvo_ros.tracking import common
+SPF=float(os.environ.get('SPF','0')); SPS=float(os.environ.get('SPS','2'));HISTORY=int(os.environ.get('HIST','8'))
+def spaced(a,b):
+    p,q=common(a.tracks,b.tracks)
+    return len(p)<8 or len(p)<SPS*len(a.tracks) or np.linalg.norm(p-q,axis=1).mean()>SPF

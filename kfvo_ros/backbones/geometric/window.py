@@ -22,6 +22,7 @@ DEPTH_PRIOR = 1.0
 """A depth wrong by 100 % costs as much as an observation wrong by the root of this [px].
 
 It keeps the scale through rotation and hovering, where nothing is measured."""
+NEW_PRIOR = 0.05
 LEAST_PRIOR_SPREAD = 0.2
 """The same for points so far away that 100 % of their inverse depth is nothing: this share of
 the median's."""
@@ -131,4 +132,4 @@ def _problem(observations: Observations, focal: float, guess: Guess, fixed: int)
     expected = guess.expected_inverse_depths
     spread = np.maximum(expected, LEAST_PRIOR_SPREAD * np.median(expected))
     return ba.Problem(observations.hosts, observations.rays, observations.seen, observations.mask,
-                      focal, fixed, DEPTH_PRIOR / spread ** 2, expected)
+                      focal, fixed, np.where(guess.new, NEW_PRIOR, DEPTH_PRIOR) / spread ** 2, expected)
