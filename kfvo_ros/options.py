@@ -16,8 +16,8 @@ from kfvo_ros.scale import SCALE_RULES
 Options = TypeVar('Options')
 
 
-def option(default: Any, description: str, choices: tuple[str, ...] = (), least: float | None = None,
-           most: float | None = None) -> Any:
+def option(default: Any, description: str, choices: tuple[str, ...] = (),
+           least: float | None = None, most: float | None = None) -> Any:
     """Declare one field: its default, what it does, and what it may be."""
     return field(default=default, metadata={'description': description, 'choices': choices,
                                             'least': least, 'most': most})
@@ -58,9 +58,9 @@ class SequenceOptions:
     stop: int | None = option(None, 'stop after so many frames', least=1)
 
 
-def add_arguments(parser: argparse.ArgumentParser, options: type) -> None:
+def add_arguments(parser: argparse.ArgumentParser, options: type[Any]) -> None:
     """Add one ``--name`` for each field of an options dataclass."""
-    group = parser.add_argument_group(options.__doc__.splitlines()[0].rstrip('.'))
+    group = parser.add_argument_group((options.__doc__ or '').splitlines()[0].rstrip('.'))
     for declared in fields(options):
         meta = declared.metadata
         default = '' if declared.default in (None, MISSING) else ' (default: %(default)s)'
@@ -77,7 +77,7 @@ def from_arguments(options: type[Options], arguments: argparse.Namespace) -> Opt
                       for declared in fields(options)})
 
 
-def _parser_of(options: type, name: str, meta: Any) -> Any:
+def _parser_of(options: type[Any], name: str, meta: Any) -> Any:
     """Return a function from text to the field's type, within its range."""
     hint = typing.get_type_hints(options)[name]
     kind = next(part for part in typing.get_args(hint) or (hint,) if part is not types.NoneType)

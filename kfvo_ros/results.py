@@ -38,8 +38,8 @@ class ResultWriter:
                             'or add --overwrite')
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            self._trajectory = open(folder / TRAJECTORY, 'w', encoding='ascii')
-            self._keyframes = open(folder / KEYFRAMES, 'w', encoding='ascii')
+            self._trajectory = (folder / TRAJECTORY).open('w', encoding='ascii')
+            self._keyframes = (folder / KEYFRAMES).open('w', encoding='ascii')
             (folder / SUMMARY).unlink(missing_ok=True)
         except OSError as error:
             raise KfvoError(f'cannot write to {folder}: {error.strerror}') from error

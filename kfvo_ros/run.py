@@ -18,7 +18,7 @@ from kfvo_ros.errors import KfvoError
 EXAMPLES = """examples:
   python -m kfvo_ros.run synthetic:7 --output out
   python -m kfvo_ros.run .../rgbd_dataset_freiburg1_desk --output out --keyframes every
-  python -m kfvo_ros.run MH_01_easy.bag --image-topic /cam0/image_raw --camera cam0.yaml --output out
+  python -m kfvo_ros.run MH_01_easy.bag --camera config/euroc_cam0.yaml --output out
 """
 
 
@@ -39,11 +39,12 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _run(argv: list[str] | None) -> int:
-    from kfvo_ros import assembly
+    # The heavy imports come after the arguments were checked: --help answers at once.
     from kfvo_ros.options import OdometryOptions, SequenceOptions, from_arguments
+    arguments = _parse(argv)
+    from kfvo_ros import assembly
     from kfvo_ros.results import ResultWriter
     from kfvo_ros.threads import single_threaded
-    arguments = _parse(argv)
     odometry_options = from_arguments(OdometryOptions, arguments)
     sequence_options = from_arguments(SequenceOptions, arguments)
     signal.signal(signal.SIGTERM, signal.default_int_handler)

@@ -21,8 +21,10 @@ CELL = 64
 """New corners are spread over cells of this size [px]."""
 MIN_DISTANCE = 12
 """Tracks start at least this far apart [px]."""
-MIN_RESPONSE = 1e-3
-"""A corner's eigenvalue must reach this share of the image's strongest."""
+HARRIS = 0.04
+"""Points whose gradients point one way, along an edge, are no corners: a track would slide."""
+MIN_RESPONSE, TINY_RESPONSE = 1e-6, 1e-6
+"""A corner's response must reach this share of the image's strongest, which is none if tiny."""
 BORDER = 8
 """No corner starts, and no track survives within half of it, this close to the rim [px]."""
 
@@ -108,8 +110,8 @@ class Tracker:
         back, returned, _ = cv2.calcOpticalFlowPyrLK(
             image, self._image, end, start.copy(), maxLevel=BACKWARD_LEVELS,
             flags=cv2.OPTFLOW_USE_INITIAL_FLOW, **FLOW)
-        height, width = image.shape
-        inside = ((end >= BORDER // 2) & (end < (width - BORDER // 2, height - BORDER // 2))).all(1)
+        rim, size = BORDER // 2, np.array(image.shape[::-1])
+        inside = ((end >= rim) & (end < size - rim)).all(axis=1)
         good = (found[:, 0] > 0) & (returned[:, 0] > 0) & inside
         good &= np.linalg.norm(back - start, axis=1) < MAX_ROUND_TRIP
         survivors = Tracks(self._tracks.ids[good], end[good].astype(np.float64))
@@ -146,14 +148,14 @@ class Tracker:
 
 def _find_corners(image: np.ndarray, occupied: np.ndarray, count: int) -> np.ndarray:
     """Return up to `count` corners (N, 2), spread over the image, away from `occupied`."""
-    response = cv2.cornerMinEigenVal(image, 3, ksize=3)
+    response = cv2.cornerHarris(image, 3, 3, HARRIS)
     response[:BORDER] = response[-BORDER:] = 0.0
     response[:, :BORDER] = response[:, -BORDER:] = 0.0
     for x, y in occupied.round().astype(int):
         cv2.circle(response, (int(x), int(y)), MIN_DISTANCE, 0.0, -1)
     reach = np.ones((MIN_DISTANCE + 1, MIN_DISTANCE + 1), dtype=np.uint8)
     peaks = (response == cv2.dilate(response, reach)) & (
-        response > max(MIN_RESPONSE * float(response.max()), 1e-6))
+        response > MIN_RESPONSE * max(float(response.max()), TINY_RESPONSE))
     y, x = np.nonzero(peaks)
     strength = response[y, x]
     cell = (y // CELL) * (image.shape[1] // CELL + 1) + x // CELL

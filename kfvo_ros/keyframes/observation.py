@@ -20,7 +20,7 @@ def observe(descriptors: Sequence[np.ndarray], T_w_frame: np.ndarray,
     the backbone's `signals` follow in their declared order: D + 7 (S - 1) + len(signals).
     """
     T_newest_keyframe = geometry.relative(T_w_frame[-1], T_w_frame[:-1])
-    poses = np.concatenate([T_newest_keyframe[:, :3, 3],
-                            geometry.quat_xyzw_from_rotation(T_newest_keyframe[:, :3, :3])], axis=1)
+    quat_xyzw = geometry.quat_xyzw_from_rotation(T_newest_keyframe[:, :3, :3])
+    poses = np.concatenate([T_newest_keyframe[:, :3, 3], quat_xyzw], axis=1)
     return np.concatenate([np.mean(descriptors, axis=0), poses.ravel(),
                            signals]).astype(np.float32)

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from kfvo_ros import geometry
 from kfvo_ros.backbones.base import Backbone, Encoded, Estimate, Status, Stream, Window
+from kfvo_ros.backbones.geometric import kernels
 from kfvo_ros.backbones.geometric.initialisation import Initialiser
 from kfvo_ros.backbones.geometric.memory import Memory, recall
 from kfvo_ros.backbones.geometric.observations import View, tabulate
@@ -66,6 +66,7 @@ class GeometricBackbone(Backbone):
 
     def __init__(self, seed: int = 0) -> None:
         self._seed = seed
+        kernels.load()
 
     def open(self, camera: Camera | None) -> GeometricStream:
         """Start a sequence; raises KfvoError without a calibration."""

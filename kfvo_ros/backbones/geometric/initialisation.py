@@ -22,6 +22,8 @@ MIN_PAIR_TRACKS = 12
 ENOUGH_TRACKS, ENOUGH_FLOW = 100, 50.0
 """More common tracks, or more flow [px], do not make a pair better."""
 MIN_RESECTION_POINTS = 6
+NEIGHBOURS = 5
+"""So many known points around it tell where a new one is expected."""
 NEAREST, FARTHEST = 0.02, 50.0
 """Triangulated inverse depths are believed within this range of the scene's median."""
 MAX_SPREAD = 0.7
@@ -34,11 +36,14 @@ ABSOLUTE_POSE = {'max_reproj_error': 3.0, 'max_iterations': 200, 'min_iterations
 
 @dataclass(frozen=True)
 class Guess:
-    """Where to start, and the inverse depths (P,) to expect when nothing better is measured."""
+    """Where to start, and the inverse depths (P,) to expect when nothing better is measured.
+
+    ``known`` (P,) marks the points that an earlier window measured.
+    """
 
     state: State
     expected_inverse_depths: np.ndarray
-    new: np.ndarray = True
+    known: np.ndarray
 
 
 class Initialiser:
@@ -73,21 +78,28 @@ class Initialiser:
         unknown = np.full(len(observations), np.nan)
         state = self._complete(observations, T_anchor_frame, unknown)
         state = state.scaled(float(np.median(state.inverse_depths)))
-        return Guess(state, np.ones(len(observations)), np.ones(len(observations),bool))
+        return Guess(state, np.ones(len(observations)), np.zeros(len(observations), dtype=bool))
 
-    def from_previous(self, observations: Observations, previous: Previous,
-                      history: History) -> Guess:
-        """Return the poses and depths known from earlier windows, and the new frame resected."""
+    def from_previous(self, observations: Observations, previous: Previous, history: History,
+                      by_epipolar_geometry: bool = False) -> Guess:
+        """Return the poses and depths known from earlier windows, and a place for the new frame.
+
+        It is resected from known points, or found by epipolar geometry from all its tracks since
+        the last keyframe, which needs known points for the length of the step alone.
+        """
         T_anchor_frame = np.concatenate([history.T_anchor_view, previous.T_anchor_frame,
                                          previous.T_anchor_latest[None]])
         known = known_inverse_depths(observations, T_anchor_frame, previous)
         is_known = np.isfinite(known)
-        T_anchor_frame[-1] = self._resect(
-            observations, T_anchor_frame, known, is_known & observations.mask[:, -1],
-            len(T_anchor_frame) - 1, previous.T_anchor_latest)
+        visible = is_known & observations.mask[:, -1]
+        if by_epipolar_geometry:
+            T_anchor_frame[-1] = self._step(observations, T_anchor_frame, known, visible)
+        else:
+            T_anchor_frame[-1] = self._resect(
+                observations, T_anchor_frame, known, visible, len(T_anchor_frame) - 1,
+                previous.T_anchor_latest)
         state = self._complete(observations, T_anchor_frame, known)
-        median = np.median(known[is_known]) if is_known.any() else np.median(state.inverse_depths)
-        return Guess(state, np.where(is_known, known, median), ~is_known)
+        return Guess(state, _expect(observations, known, state.inverse_depths), is_known)
 
     def _best_pair(self, observations: Observations) -> tuple[int, int] | None:
         """Return the two frames whose relative pose is best determined."""
@@ -115,6 +127,31 @@ class Initialiser:
         length = np.linalg.norm(T_i_j[:3, 3])
         T_i_j[:3, 3] /= length if length > 0.0 else 1.0
         return T_i_j
+
+    def _step(self, observations: Observations, T_anchor_frame: np.ndarray,
+              inverse_depths: np.ndarray, visible: np.ndarray) -> np.ndarray:
+        """Return T_anchor_newest from the relative pose to the frame before it.
+
+        The length of the step is the median of what each known point asks for: with X in the
+        older frame and ray x in the newer, x x (R X + s t) = 0.
+        """
+        latest = T_anchor_frame[-1]
+        newest, keyframe = len(T_anchor_frame) - 1, len(T_anchor_frame) - 2
+        both = observations.mask[:, newest] & observations.mask[:, keyframe]
+        if both.sum() < MIN_PAIR_TRACKS or visible.sum() < MIN_RESECTION_POINTS:
+            return latest
+        T_keyframe_newest = self._relative_pose(observations, keyframe, newest)
+        T_newest_keyframe = geometry.invert(T_keyframe_newest)
+        T_keyframe_host = geometry.relative(T_anchor_frame[keyframe],
+                                            T_anchor_frame[observations.hosts[visible]])
+        X = np.einsum('pij,pj->pi', T_keyframe_host[:, :3, :3], observations.rays[visible]
+                      / inverse_depths[visible, None]) + T_keyframe_host[:, :3, 3]
+        x = np.column_stack([observations.seen[visible, newest], np.ones(visible.sum())])
+        turned = np.cross(x, X @ T_newest_keyframe[:3, :3].T)
+        moved = np.cross(x, T_newest_keyframe[:3, 3])
+        lengths = -(turned * moved).sum(axis=1) / np.maximum((moved * moved).sum(axis=1), 1e-12)
+        T_keyframe_newest[:3, 3] *= max(float(np.median(lengths)), 0.0)
+        return T_anchor_frame[keyframe] @ T_keyframe_newest
 
     def _resect_in_turn(self, observations: Observations, T_w_frame: np.ndarray,
                         placed: np.ndarray, frame: int, fallback: np.ndarray) -> np.ndarray:
@@ -176,6 +213,24 @@ def known_inverse_depths(observations: Observations, T_anchor_frame: np.ndarray,
     in_front = depths > kernels.MIN_DEPTH
     inverse_depths[rows[in_front]] = 1.0 / depths[in_front]
     return inverse_depths
+
+
+def _expect(observations: Observations, known: np.ndarray, filled: np.ndarray) -> np.ndarray:
+    """Return known inverse depths, and for new points those of their neighbours in the image.
+
+    A new point is most likely as far as what is known around it in the newest frame; where
+    nothing is, as the scene's median.
+    """
+    is_known = np.isfinite(known)
+    expected = np.where(is_known, known, np.median(known[is_known] if is_known.any() else filled))
+    visible = observations.mask[:, -1]
+    old, new = np.flatnonzero(is_known & visible), np.flatnonzero(~is_known & visible)
+    if len(old) >= NEIGHBOURS and len(new):
+        points = observations.seen[:, -1]
+        distances = np.linalg.norm(points[new, None] - points[None, old], axis=2)
+        nearest = np.argpartition(distances, NEIGHBOURS - 1, axis=1)[:, :NEIGHBOURS]
+        expected[new] = np.median(known[old[nearest]], axis=1)
+    return expected
 
 
 def _triangulate(observations: Observations,

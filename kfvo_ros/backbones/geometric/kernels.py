@@ -71,8 +71,11 @@ def reprojection_errors(rotations, translations, inverse_depths, hosts, rays, se
 
 @_compiled
 def _differentiate(rotations, translations, h, j, ray, b, r, p, focal, J, J_depth):
-    """Fill J (2, 12) = d residual / d (host rotation, host shift, seen rotation, seen shift)
-    and J_depth (2,) = d residual / d inverse depth."""
+    """Fill the derivatives of a residual.
+
+    J (2, 12) is that by host rotation, host shift, seeing rotation and seeing shift; J_depth
+    (2,) that by the inverse depth.
+    """
     x, y, z = p
     for a in range(2):
         # d residual_a / d p, then the same turned into the anchor and into the host.
@@ -175,3 +178,14 @@ def triangulate(rotations, translations, hosts, rays, seen, mask):
         if weights[k] > 0.0:
             inverse_depths[k] = numerator / weights[k]
     return inverse_depths, weights
+
+
+def load() -> None:
+    """Compile every kernel, or load it from the cache, before a frame would wait for it."""
+    rotations, translations = np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3))
+    hosts, rays, seen = np.zeros(1, dtype=np.int64), np.ones((1, 3)), np.zeros((1, 2, 2))
+    mask = np.ones((1, 2), dtype=bool)
+    state = rotations, translations, np.ones(1)
+    reprojection_errors(*state, hosts, rays, seen, mask, 1.0)
+    linearise(*state, hosts, rays, seen, mask, 1.0, 1.0, 1)
+    triangulate(rotations, translations, hosts, rays, seen, mask)

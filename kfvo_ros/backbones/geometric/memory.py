@@ -20,6 +20,10 @@ scale. They are final and cost no unknowns.
 """
 
 
+MAX_SHARED = 0.8
+"""A keyframe joins the history when it shares fewer tracks with the one before it there."""
+
+
 @dataclass(frozen=True)
 class Memory:
     """The views of a window and its history at ``T_anchor_view``.
@@ -41,7 +45,10 @@ class History:
 
 
 def recall(previous: Previous | None, anchor: View) -> History:
-    """Return the keyframes before `anchor` that the last window knew for certain."""
+    """Return the keyframes before `anchor` that the last window knew for certain.
+
+    Keyframes that hardly differ from the one before them would only shorten the baselines.
+    """
     if previous is None or not previous.memory.certain:
         return History()
     memory = previous.memory
@@ -49,17 +56,18 @@ def recall(previous: Previous | None, anchor: View) -> History:
     if anchor.index not in indices:
         return History()
     position = indices.index(anchor.index)
-    keep=[]
-    for i in range(position):
-        if not keep or spaced(memory.views[keep[-1]],memory.views[i]): keep.append(i)
-    keep=keep[-HISTORY:]
-    if not keep: return History()
-    T_anchor_view = geometry.relative(memory.T_anchor_view[position], memory.T_anchor_view[keep])
+    spaced: list[int] = []
+    for older in range(position):
+        if not spaced or _differ(memory.views[spaced[-1]], memory.views[older]):
+            spaced.append(older)
+    spaced = spaced[-HISTORY:]
+    T_anchor_view = geometry.relative(memory.T_anchor_view[position],
+                                      memory.T_anchor_view[spaced])
     T_anchor_view[:, :3, 3] *= previous.memory_scale
-    return History(tuple(memory.views[i] for i in keep), T_anchor_view)
-import os
-from kfvo_ros.tracking import common
-SPF=float(os.environ.get('SPF','0')); SPS=float(os.environ.get('SPS','2'));HISTORY=int(os.environ.get('HIST','8'))
-def spaced(a,b):
-    p,q=common(a.tracks,b.tracks)
-    return len(p)<8 or len(p)<SPS*len(a.tracks) or np.linalg.norm(p-q,axis=1).mean()>SPF
+    return History(tuple(memory.views[index] for index in spaced), T_anchor_view)
+
+
+def _differ(older: View, newer: View) -> bool:
+    """Return whether enough of the older view's tracks ended before the newer one."""
+    shared = np.isin(older.tracks.ids, newer.tracks.ids, assume_unique=True).sum()
+    return bool(shared < MAX_SHARED * len(older.tracks))

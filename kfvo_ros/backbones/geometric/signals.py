@@ -44,7 +44,7 @@ def measure_motion(solution: Solution, keyframe: View, newest: View, focal: floa
 
 
 def signals(solution: Solution, motion: Motion) -> np.ndarray:
-    """Return (len(SIGNAL_NAMES),) float32; pixels, rotation [rad] and information as log(1 + x)."""
+    """Return (len(SIGNAL_NAMES),) float32; pixels and information as log(1 + x), angles [rad]."""
     poses = solution.T_anchor_frame
     T_keyframe_newest = geometry.relative(poses[-2], poses[-1])
     points = solution.points()

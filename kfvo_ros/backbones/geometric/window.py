@@ -18,14 +18,17 @@ from kfvo_ros.backbones.geometric.observations import Observations
 ITERATIONS, FINAL_ITERATIONS = 8, 4
 MAX_ERROR = 3.0
 """Observations farther off after the first adjustment are outliers [px]."""
-DEPTH_PRIOR = 1.0
-"""A depth wrong by 100 % costs as much as an observation wrong by the root of this [px].
+KNOWN_DEPTH_PRIOR = 1.0
+"""How strongly a point holds its last depth [px^2 for a depth wrong by 100 %].
 
 It keeps the scale through rotation and hovering, where nothing is measured."""
-NEW_PRIOR = 0.05
+NEW_DEPTH_PRIOR = 0.3
+"""The same for new points and the depth around them: they are less certain to have it."""
 LEAST_PRIOR_SPREAD = 0.2
 """The same for points so far away that 100 % of their inverse depth is nothing: this share of
 the median's."""
+SUSPICIOUS_SHARE = 0.7
+"""When fewer of the newest frame's tracks fit, its first place may have been wrong."""
 MIN_INFORMATION = 100.0
 """The median depth is known to 10 % from tracks good to a pixel: worth to be held on to."""
 LEAST_NOISE = 0.1
@@ -61,6 +64,11 @@ class Solution:
         return poses
 
     @property
+    def newest_inlier_share(self) -> float:
+        """Share of the newest frame's observations that fit."""
+        return float(self.inliers[:, -1].sum()) / max(1, self.observations.mask[:, -1].sum())
+
+    @property
     def certain(self) -> bool:
         """Whether depths are measured well enough to be held on to."""
         information = self.points().information
@@ -84,7 +92,8 @@ class Solution:
         """
         free = self.state.rotations[self.anchor + 1:]
         measured = self.inliers & (self.errors > 0.0)
-        noise = max(LEAST_NOISE, float(np.median(self.errors[measured])) if measured.any() else 1.0)
+        typical = float(np.median(self.errors[measured])) if measured.any() else 1.0
+        noise = max(LEAST_NOISE, typical)
         system, _ = self.normal.reduce()
         blocks = noise ** 2 * np.linalg.pinv(system, hermitian=True)
         covariance = np.zeros((len(free) + 1, 6, 6))
@@ -103,13 +112,18 @@ def solve(observations: Observations, initialiser: Initialiser, previous: Previo
     While little is known, a start from nothing competes with the one from the last window,
     which may sit in a wrong minimum.
     """
-    guesses = []
+    anchor, focal = len(history.views), initialiser.focal
+    solutions = []
     if previous is not None and previous.points is not None:
-        guesses.append(initialiser.from_previous(observations, previous, history))
+        guess = initialiser.from_previous(observations, previous, history)
+        solutions.append(_solve_from(observations, focal, guess, anchor))
+        if solutions[0].newest_inlier_share < SUSPICIOUS_SHARE:
+            guess = initialiser.from_previous(observations, previous, history, True)
+            solutions.append(_solve_from(observations, focal, guess, anchor))
     if previous is None or not previous.memory.certain:
-        guesses.append(initialiser.from_nothing(observations))
-    return min((_solve_from(observations, initialiser.focal, guess, len(history.views))
-                for guess in guesses), key=lambda solution: solution.cost)
+        guess = initialiser.from_nothing(observations)
+        solutions.append(_solve_from(observations, focal, guess, anchor))
+    return min(solutions, key=lambda solution: solution.cost)
 
 
 def _solve_from(observations: Observations, focal: float, guess: Guess,
@@ -130,6 +144,7 @@ def _solve_from(observations: Observations, focal: float, guess: Guess,
 def _problem(observations: Observations, focal: float, guess: Guess, fixed: int) -> ba.Problem:
     """Return the bundle adjustment of a window, depths drawn to where they are expected."""
     expected = guess.expected_inverse_depths
+    strength = np.where(guess.known, KNOWN_DEPTH_PRIOR, NEW_DEPTH_PRIOR)
     spread = np.maximum(expected, LEAST_PRIOR_SPREAD * np.median(expected))
     return ba.Problem(observations.hosts, observations.rays, observations.seen, observations.mask,
-                      focal, fixed, np.where(guess.new, NEW_PRIOR, DEPTH_PRIOR) / spread ** 2, expected)
+                      focal, fixed, strength / spread ** 2, expected)

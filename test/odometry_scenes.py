@@ -1,0 +1,146 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Scenes for the odometry's tests: projected point clouds and small rendered sequences."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+
+from kfvo_ros import geometry
+from kfvo_ros.backbones.base import Backbone, Encoded
+from kfvo_ros.backbones.geometric.backbone import GeometricBackbone
+from kfvo_ros.backbones.geometric.observations import View
+from kfvo_ros.camera import Camera
+from kfvo_ros.keyframes.base import DecisionInput, KeyframePolicy
+from kfvo_ros.keyframes.heuristics import Survival
+from kfvo_ros.odometry import KeyframeOdometry, Placed, Update
+from kfvo_ros.sequences.base import Frame
+from kfvo_ros.sequences.synthetic import SyntheticSequence
+from kfvo_ros.tracking import Tracks
+from kfvo_ros.trajectory import Trajectory
+
+CAMERA = Camera(640, 480, 400.0, 400.0, 319.5, 239.5)
+RATE_NS = 50_000_000
+
+
+class PointCloud:
+    """Random points in front of the first camera, seen with `noise` [px]."""
+
+    def __init__(self, seed: int, count: int = 300, noise: float = 0.0) -> None:
+        self._rng = np.random.default_rng(seed)
+        depths = self._rng.uniform(3.0, 8.0, count)
+        self.points = np.column_stack([self._rng.uniform(-0.7, 0.7, (count, 2)), np.ones(count)])
+        self.points *= depths[:, None]
+        self.noise = noise
+
+    def pixels(self, T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return where all points (N, 2) are seen, and a mask of those that are."""
+        T_camera_world = geometry.invert(T_world_camera)
+        points = self.points @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]
+        pixels = points[:, :2] / points[:, 2:] * CAMERA.fx + (CAMERA.cx, CAMERA.cy)
+        inside = (pixels > 0.0).all(axis=1) & (pixels < (CAMERA.width, CAMERA.height)).all(axis=1)
+        return pixels, inside & (points[:, 2] > 0.1)
+
+    def encode(self, index: int, T_world_camera: np.ndarray) -> Encoded:
+        """Return what the geometric backbone's `encode` would: exact tracks, then noise."""
+        pixels, visible = self.pixels(T_world_camera)
+        pixels = pixels + self.noise * self._rng.normal(size=pixels.shape)
+        tracks = Tracks(np.flatnonzero(visible), pixels[visible])
+        view = View(index, tracks, CAMERA.undistort(tracks.pixels))
+        descriptor = np.full(48, index, dtype=np.float32)
+        return Encoded(index * RATE_NS, descriptor, view, tracks)
+
+
+def moving_poses(count: int, step: float = 0.15) -> np.ndarray:
+    """Return poses (N, 4, 4) of a camera that goes right and forward and turns a little."""
+    along = np.arange(count)[:, None]
+    return geometry.make_transform(
+        geometry.exp_so3(along * [0.004, 0.012, -0.006]),
+        along * step * np.array([0.8, 0.1, 0.6]) + 0.05 * np.sin(0.9 * along + [0.0, 1.0, 2.0]))
+
+
+def turning_poses(count: int) -> np.ndarray:
+    """Return poses (N, 4, 4) of a camera that turns on the spot."""
+    return geometry.make_transform(
+        geometry.exp_so3(np.arange(count)[:, None] * [0.004, 0.02, -0.006]), np.zeros(3))
+
+
+@lru_cache(maxsize=8)
+def frames_of(seed: int, count: int = 60, style: str = 'smooth', width: int = 320,
+              height: int = 240) -> tuple[Frame, ...]:
+    """Return rendered frames; the same objects at every call."""
+    return tuple(SyntheticSequence(seed, style, count, width, height))
+
+
+def truth_of(seed: int, count: int = 60, style: str = 'smooth') -> Trajectory:
+    """Return the poses behind `frames_of`."""
+    return SyntheticSequence(seed, style, count).ground_truth().trajectory
+
+
+def restamped(images: Iterable[np.ndarray], camera: Camera) -> list[Frame]:
+    """Return frames of images in a new order."""
+    return [Frame(RATE_NS * (1 + index), image, camera) for index, image in enumerate(images)]
+
+
+@dataclass
+class Run:
+    """All that came out of an odometry."""
+
+    updates: list[Update]
+    placed: list[Placed]
+    handed_out: list[np.ndarray]
+
+    @property
+    def poses(self) -> np.ndarray:
+        """Final poses (N, 4, 4) in input order."""
+        return np.stack([placed.T_world_camera for placed in self.placed])
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """Final poses with their stamps."""
+        return Trajectory(np.array([placed.stamp_ns for placed in self.placed]), self.poses)
+
+    @property
+    def statuses(self) -> list[str]:
+        """What was said of each frame."""
+        return [update.status.value for update in self.updates]
+
+
+def run(frames: Iterable[Frame], policy: KeyframePolicy | None = None,
+        backbone: Backbone | None = None, **options) -> Run:
+    """Feed frames to a new odometry; `handed_out` are the poses at the moment of finality."""
+    odometry = KeyframeOdometry(backbone or GeometricBackbone(), policy or Survival(), **options)
+    result = Run([], [], [])
+    for frame in frames:
+        update = odometry.process(frame)
+        result.updates.append(update)
+        result.placed.extend(update.final)
+        result.handed_out.extend(placed.T_world_camera.copy() for placed in update.final)
+    last = odometry.finish()
+    result.placed.extend(last)
+    result.handed_out.extend(placed.T_world_camera.copy() for placed in last)
+    return result
+
+
+class Scripted(KeyframePolicy):
+    """Keeps or drops as a list says, then as its last entry does."""
+
+    name = 'scripted'
+
+    def __init__(self, *keeps: bool) -> None:
+        self._keeps = list(keeps)
+        self.seen: list[DecisionInput] = []
+
+    def decide(self, decision: DecisionInput) -> bool:
+        """Follow the list."""
+        self.seen.append(decision)
+        return self._keeps.pop(0) if len(self._keeps) > 1 else self._keeps[0]
+
+
+def with_image(frame: Frame, image: np.ndarray) -> Frame:
+    """Return the frame showing something else."""
+    return replace(frame, image=image)

@@ -1,0 +1,141 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Options declared once: the command line that follows from them, and what is built."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import FrozenInstanceError, asdict, fields
+
+import numpy as np
+import pytest
+
+from kfvo_ros import assembly
+from kfvo_ros.errors import KfvoError
+from kfvo_ros.keyframes import POLICIES
+from kfvo_ros.options import OdometryOptions, SequenceOptions, add_arguments, from_arguments
+from kfvo_ros.scale import SCALE_RULES
+
+OTHER = {
+    OdometryOptions: OdometryOptions(scale='translation', keyframes='optical_flow',
+                                     flow_threshold=12.5, survival_share=0.25, window_size=5,
+                                     seed=17),
+    SequenceOptions: SequenceOptions(kind='tum', camera='a b.yaml', image_topic='/cam0/image',
+                                     ground_truth_topic='/vicon',
+                                     ground_truth_to_camera='0 0 0 0 0 0 1', rate=29.97, stop=3),
+}
+
+
+def parse(options, *arguments):
+    parser = argparse.ArgumentParser()
+    add_arguments(parser, options)
+    return from_arguments(options, parser.parse_args(list(arguments)))
+
+
+@pytest.mark.parametrize('options', [OdometryOptions, SequenceOptions])
+def test_no_arguments_are_the_defaults(options):
+    assert parse(options) == options()
+
+
+@pytest.mark.parametrize('options', [OdometryOptions, SequenceOptions])
+def test_every_field_goes_through_the_command_line(options):
+    wanted = OTHER[options]
+    different = [name for name, value in asdict(wanted).items()
+                 if value != getattr(options(), name)]
+    assert set(different) >= {field.name for field in fields(options)} - {'backbone'}
+    arguments = [text for name, value in asdict(wanted).items()
+                 for text in (f'--{name.replace("_", "-")}', str(value))]
+    parsed = parse(options, *arguments)
+    assert parsed == wanted
+    assert [type(value) for value in asdict(parsed).values()] == [
+        type(value) for value in asdict(wanted).values()]
+
+
+@pytest.mark.parametrize(('options', 'arguments', 'complaint'), [
+    (OdometryOptions, ['--window-size', '2'], 'at least 3'),
+    (OdometryOptions, ['--window-size', '33'], 'at most 32'),
+    (OdometryOptions, ['--window-size', '8.5'], '8.5'),
+    (OdometryOptions, ['--survival-share', '1.01'], 'at most 1'),
+    (OdometryOptions, ['--survival-share', '-0.1'], 'at least 0'),
+    (OdometryOptions, ['--survival-share', 'nan'], 'nan'),
+    (OdometryOptions, ['--flow-threshold', '-1'], 'at least 0'),
+    (OdometryOptions, ['--flow-threshold', 'far'], 'far'),
+    (OdometryOptions, ['--seed', '-1'], 'at least 0'),
+    (OdometryOptions, ['--keyframes', 'often'], "'often'"),
+    (OdometryOptions, ['--scale', 'metric'], "'metric'"),
+    (OdometryOptions, ['--backbone', 'orb'], "'orb'"),
+    (OdometryOptions, ['--unheard-of', '1'], '--unheard-of'),
+    (SequenceOptions, ['--stop', '0'], 'at least 1'),
+    (SequenceOptions, ['--rate', '0'], 'at least 0.001'),
+    (SequenceOptions, ['--rate', 'nan'], 'nan'),
+])
+def test_wrong_values_are_refused_with_what_came(options, arguments, complaint, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        parse(options, *arguments)
+    assert stopped.value.code == 2
+    message = capsys.readouterr().err.splitlines()[-1]
+    assert complaint in message
+
+
+def test_range_ends_are_allowed():
+    assert parse(OdometryOptions, '--survival-share', '1').survival_share == 1.0
+    assert parse(OdometryOptions, '--window-size', '3').window_size == 3
+    assert parse(OdometryOptions, '--window-size', '32').window_size == 32
+
+
+def test_help_describes_each_option():
+    parser = argparse.ArgumentParser()
+    for options in (OdometryOptions, SequenceOptions):
+        add_arguments(parser, options)
+    text = ' '.join(parser.format_help().split())
+    for declared in (*fields(OdometryOptions), *fields(SequenceOptions)):
+        assert f'--{declared.name.replace("_", "-")}' in text
+        assert ' '.join(declared.metadata['description'].split()) in text
+    assert '(default: 0.8)' in text
+    assert all(name in text for name in (*POLICIES, *SCALE_RULES))
+
+
+def test_options_cannot_be_changed():
+    with pytest.raises(FrozenInstanceError):
+        OdometryOptions().seed = 1
+
+
+@pytest.mark.parametrize('keyframes', POLICIES)
+def test_odometry_is_what_the_options_say(keyframes):
+    odometry = assembly.make_odometry(OdometryOptions(
+        keyframes=keyframes, flow_threshold=12.5, survival_share=0.25, window_size=5,
+        scale='none'))
+    assert odometry.policy.name == keyframes
+    assert odometry.window_size == 5
+    assert odometry.scale.rule == 'none'
+    assert odometry.backbone.name == 'geometric'
+    if keyframes == 'optical_flow':
+        assert odometry.policy.threshold == 12.5
+    if keyframes == 'survival':
+        assert odometry.policy.share == 0.25
+
+
+def test_scale_rule_is_the_backbones_unless_chosen():
+    assert assembly.make_odometry(OdometryOptions()).scale.rule == 'depth'
+
+
+def test_transform_of_seven_numbers():
+    transform = assembly.parse_transform('1, 2 3 0 0 0.5 0.5')
+    np.testing.assert_allclose(transform[:3, 3], [1.0, 2.0, 3.0])
+    np.testing.assert_allclose(transform[:3, :3], [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-12)
+    assert assembly.parse_transform(None) is None
+
+
+@pytest.mark.parametrize('text', ['', '1 2 3', '1 2 3 0 0 0 0', 'a b c d e f g',
+                                  'nan 0 0 0 0 0 1', '1 2 3 0 0 0 1 9'])
+def test_other_transforms_are_refused(text):
+    with pytest.raises(KfvoError, match='seven numbers'):
+        assembly.parse_transform(text)
+
+
+def test_sequence_takes_its_options(tmp_path):
+    with pytest.raises(KfvoError, match='unknown kind'):
+        assembly.make_sequence('synthetic:1', SequenceOptions(kind='nothing'))
+    with pytest.raises(KfvoError, match='cannot read the calibration'):
+        assembly.make_sequence('synthetic:1', SequenceOptions(camera=str(tmp_path / 'no.yaml')))
+    assert assembly.make_sequence('synthetic:1:fast', SequenceOptions()).name == 'synthetic:1:fast'
