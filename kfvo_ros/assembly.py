@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
 from kfvo_ros import geometry
@@ -43,7 +45,7 @@ def make_sequence(text: str, options: SequenceOptions) -> Sequence:
     """Open the sequence; raises KfvoError."""
     return open_sequence(
         text, kind=options.kind, image_topic=options.image_topic,
-        camera=read_camera_info(options.camera) if options.camera else None,
+        camera=read_camera_info(Path(options.camera)) if options.camera else None,
         ground_truth_topic=options.ground_truth_topic,
         ground_truth_to_camera=parse_transform(options.ground_truth_to_camera),
         rate=options.rate)

@@ -9,7 +9,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from kfvo_ros import geometry
-from kfvo_ros.backbones.base import Backbone, Encoded, Estimate, Status, Stream, Window
+from kfvo_ros.backbones.base import (
+    Backbone,
+    Encoded,
+    Estimate,
+    Previous,
+    Status,
+    Stream,
+    Window,
+)
 from kfvo_ros.images import to_grey
 from kfvo_ros.keyframes.base import DecisionInput, KeyframePolicy
 from kfvo_ros.keyframes.observation import observe
@@ -29,7 +37,7 @@ class Keyframe:
     """A frame in the window; its pose T_world_camera is overwritten by every window it is in."""
 
     encoded: Encoded
-    tracks: Tracks | None
+    tracks: Tracks
     index: int
     T_world_camera: np.ndarray
 
@@ -88,8 +96,12 @@ class KeyframeOdometry:
         self._stream: Stream | None = None
         self._tracker: Tracker | None = None
         self._keyframes: list[Keyframe] = []
+        self._newest: Keyframe
         self._pending: list[Placed] = []
         self._known = Knowledge()
+        self._previous: Previous | None = None
+        self._status = Status.OK
+        self._covariance = np.zeros((6, 6))
         self._lost_in_a_row = 0
         self._frames_seen = 0
 
@@ -147,7 +159,7 @@ class KeyframeOdometry:
 
     def commit(self, keep: bool, durations: dict[str, float]) -> Update:
         """Keep or drop the newest frame (step 6) and return what it changed."""
-        newest, final = self._newest, ()
+        newest, final = self._newest, tuple[Placed, ...]()
         if keep:
             if len(self._keyframes) == self.window_size - 1:
                 final = self._retire(self._keyframes.pop(0))
@@ -157,7 +169,7 @@ class KeyframeOdometry:
             last = self._keyframes[-1]
             placed = Placed(newest.encoded.stamp_ns, last,
                             geometry.relative(last.T_world_camera, newest.T_world_camera), False)
-            self._stream.release(newest.encoded)
+            self._release(newest)
         self._pending.append(placed)
         points = self._known.points
         depth = None if points is None or not len(points.ids) else float(np.median(
@@ -176,10 +188,12 @@ class KeyframeOdometry:
         """Frames whose poses may still change, in input order."""
         return tuple(self._pending)
 
-    def _track(self, frame: Frame, encoded: Encoded) -> Tracks | None:
-        """Return the backbone's tracks, or our own where only the policy asks for them."""
-        if encoded.tracks is not None or not self.policy.needs_tracks:
+    def _track(self, frame: Frame, encoded: Encoded) -> Tracks:
+        """Return the backbone's tracks, our own if only the policy asks, or none."""
+        if encoded.tracks is not None:
             return encoded.tracks
+        if not self.policy.needs_tracks:
+            return Tracks()
         if self._tracker is None:
             self._tracker = Tracker(frame.camera)
         return self._tracker.track(to_grey(frame.image))
@@ -202,7 +216,7 @@ class KeyframeOdometry:
 
     def _retire(self, keyframe: Keyframe) -> tuple[Placed, ...]:
         """Let a keyframe leave the window; return the frames that hang on it, final now."""
-        self._stream.release(keyframe.encoded)
+        self._release(keyframe)
         count = 0
         while count < len(self._pending) and self._pending[count].keyframe is keyframe:
             count += 1
@@ -213,5 +227,10 @@ class KeyframeOdometry:
         """Empty the window: the next frame starts another one where the camera was last seen."""
         self._lost_in_a_row = 0
         for keyframe in self._keyframes:
-            self._stream.release(keyframe.encoded)
+            self._release(keyframe)
         self._keyframes.clear()
+
+    def _release(self, frame: Keyframe) -> None:
+        """Let the backbone free what it holds for a frame."""
+        if self._stream is not None:
+            self._stream.release(frame.encoded)

@@ -73,8 +73,9 @@ def add_arguments(parser: argparse.ArgumentParser, options: type[Any]) -> None:
 
 def from_arguments(options: type[Options], arguments: argparse.Namespace) -> Options:
     """Build the dataclass from parsed arguments."""
-    return options(**{declared.name: getattr(arguments, declared.name)
-                      for declared in fields(options)})
+    values = {declared.name: getattr(arguments, declared.name)
+              for declared in fields(options)}  # type: ignore[arg-type]
+    return options(**values)
 
 
 def _parser_of(options: type[Any], name: str, meta: Any) -> Any:

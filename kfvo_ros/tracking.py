@@ -90,7 +90,7 @@ class Tracker:
         next ones are tracked from the frame before it, until the scene is taken for a new one.
         """
         image = self._equaliser.apply(grey)
-        survivors = self._follow(image) if self._image is not None else Tracks()
+        survivors = self._follow(self._image, image)
         gone = len(survivors) < MIN_SURVIVORS <= len(self._tracks)
         if gone and self._blinks < MAX_BLINKS:
             self._blinks += 1
@@ -100,15 +100,15 @@ class Tracker:
         self._tracks = self._refill(image, survivors)
         return self._tracks
 
-    def _follow(self, image: np.ndarray) -> Tracks:
-        """Track the last frame's corners into `image` and drop those that do not agree."""
-        if len(self._tracks) == 0 or image.shape != self._image.shape:
+    def _follow(self, last: np.ndarray | None, image: np.ndarray) -> Tracks:
+        """Track the last image's corners into `image` and drop those that do not agree."""
+        if last is None or len(self._tracks) == 0 or image.shape != last.shape:
             return Tracks()
         start = self._tracks.pixels.astype(np.float32)
-        end, found, _ = cv2.calcOpticalFlowPyrLK(self._image, image, start, None,
+        end, found, _ = cv2.calcOpticalFlowPyrLK(last, image, start, None,
                                                  maxLevel=FORWARD_LEVELS, **FLOW)
         back, returned, _ = cv2.calcOpticalFlowPyrLK(
-            image, self._image, end, start.copy(), maxLevel=BACKWARD_LEVELS,
+            image, last, end, start.copy(), maxLevel=BACKWARD_LEVELS,
             flags=cv2.OPTFLOW_USE_INITIAL_FLOW, **FLOW)
         rim, size = BORDER // 2, np.array(image.shape[::-1])
         inside = ((end >= rim) & (end < size - rim)).all(axis=1)
@@ -125,7 +125,7 @@ class Tracker:
         if self._camera is not None:
             focal = 0.5 * (self._camera.fx + self._camera.fy)
             before, after = (focal * self._camera.undistort(p) for p in (before, after))
-            everyone = np.isfinite(before).all(axis=1) & np.isfinite(after).all(axis=1)
+            everyone &= np.isfinite(before).all(axis=1) & np.isfinite(after).all(axis=1)
         options = {'max_epipolar_error': MAX_EPIPOLAR_ERROR, 'min_iterations': 50,
                    'max_iterations': 300, 'seed': self._seed}
         _, info = poselib.estimate_fundamental(before[everyone], after[everyone], options, {})

@@ -65,16 +65,14 @@ def blinded(frames, first: int, count: int, value: int) -> list[Frame]:
             if first <= index < first + count else frame for index, frame in enumerate(frames)]
 
 
-@POLICIES
-@pytest.mark.parametrize('value', [0, 255, 128])
+@pytest.mark.parametrize(('policy', 'value'), [(Every, 0), (Survival, 255), (Survival, 128)])
 def test_no_texture_at_all(frames, policy, value):
     result = checked(blinded(frames[:16], 0, 16, value), policy)
     assert 'ok' not in result.statuses[1:]
     assert np.array_equal(result.poses, np.tile(np.eye(4), (16, 1, 1)))
 
 
-@POLICIES
-@pytest.mark.parametrize('count', [1, 3, 9])
+@pytest.mark.parametrize(('policy', 'count'), [(Survival, 1), (Every, 3), (Survival, 9)])
 def test_black_from_the_start(frames, policy, count):
     result = checked(blinded(frames, 0, count, 0), policy)
     assert set(result.statuses[1:count]) <= {'lost'}
@@ -82,9 +80,9 @@ def test_black_from_the_start(frames, policy, count):
     assert relative_error(result, list(range(count + 2, COUNT))) < 0.03
 
 
-@POLICIES
-@pytest.mark.parametrize(('first', 'count', 'value'), [
-    (20, 1, 0), (20, 3, 0), (20, 1, 255), (20, 2, 255), (4, 2, 0)])
+@pytest.mark.parametrize(('policy', 'first', 'count', 'value'), [
+    (Survival, 20, 1, 0), (Every, 20, 3, 0), (Every, 20, 1, 255), (Survival, 20, 2, 255),
+    (Survival, 4, 2, 0)])
 def test_a_blink_is_bridged(frames, policy, first, count, value):
     result = checked(blinded(frames, first, count, value), policy)
     assert result.statuses[first:first + count] == ['lost'] * count
@@ -99,6 +97,8 @@ def test_long_darkness_starts_anew_where_it_ended(frames, policy):
     result = checked(blinded(frames, 18, 10, 0), policy)
     assert set(result.statuses[18:28]) == {'lost'}
     assert set(result.statuses[32:]) == {'ok'}
+    sure = np.median([np.trace(update.covariance) for update in result.updates[8:18]])
+    assert min(np.trace(update.covariance) for update in result.updates[18:28]) > 100.0 * sure
     assert steps(result).max() < 6.0
     assert relative_error(result, list(range(18))) < 0.02
     # The segment after it has the shape of the truth; of its scale only the depths told.
@@ -146,16 +146,14 @@ def test_repeated_frames_in_the_middle(frames, policy):
     assert error.rmse < 0.02 * error.path_length
 
 
-@POLICIES
-def test_doubled_frames(frames, policy):
+def test_doubled_frames(frames):
     doubled = [frame.image for frame in frames[:20] for _ in range(2)]
-    result = checked(restamped(doubled, frames[0].camera), policy)
+    result = checked(restamped(doubled, frames[0].camera))
     assert 'lost' not in result.statuses
     assert relative_error(Run([], result.placed[::2], []), list(range(20))) < 0.03
 
 
-@POLICIES
-@pytest.mark.parametrize('noise', [0.0, 4.0])
+@pytest.mark.parametrize(('policy', 'noise'), [(Every, 0.0), (Every, 4.0), (Survival, 4.0)])
 def test_standstill_from_the_start(frames, policy, noise):
     rng = np.random.default_rng(0)
     images = [np.clip(frames[0].image + noise * rng.normal(size=frames[0].image.shape), 0, 255
@@ -165,7 +163,7 @@ def test_standstill_from_the_start(frames, policy, noise):
     assert set(result.statuses[1:]) == {'held'}
     depth = np.median([update.median_depth for update in result.updates[1:]])
     assert metrics.extent(result.trajectory) / depth < 0.02
-    assert metrics.max_rotation_deg(result.trajectory) < 0.5
+    assert metrics.max_rotation_deg(result.trajectory) < 1.0
 
 
 CAMERA = Camera(320, 240, 400.0, 400.0, 159.5, 119.5)
@@ -183,11 +181,10 @@ def turned_images(angles: np.ndarray) -> list[np.ndarray]:
     return result
 
 
-@POLICIES
-def test_pure_rotation_from_the_start(policy):
+def test_pure_rotation_from_the_start():
     along = np.linspace(0.0, 1.0, 30)[:, None]
     angles = (along - 0.5) * np.array([0.06, 0.35, 0.1])
-    result = checked(restamped(turned_images(angles), CAMERA), policy)
+    result = checked(restamped(turned_images(angles), CAMERA))
     assert 'lost' not in result.statuses
     assert result.statuses.count('held') > 20
     truth = geometry.exp_so3(angles)
@@ -227,18 +224,16 @@ def test_very_short_sequences(frames, count):
     assert result.updates[0].final == ()
 
 
-@POLICIES
 @pytest.mark.parametrize(('width', 'height'), [(64, 48), (32, 24), (16, 12), (3, 2)])
-def test_tiny_images(policy, width, height):
-    checked(list(SyntheticSequence(3, 'smooth', 20, width, height)), policy)
+def test_tiny_images(width, height):
+    checked(list(SyntheticSequence(3, 'smooth', 20, width, height)))
 
 
-@pytest.mark.parametrize('policy', [Every])
-def test_noise_without_any_motion_in_it(policy):
+def test_noise_without_any_motion_in_it():
     rng = np.random.default_rng(0)
     images = [rng.integers(0, 256, (120, 160), dtype=np.uint8) for _ in range(24)]
     camera = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)
-    result = checked(restamped(images, camera), policy)
+    result = checked(restamped(images, camera))
     assert 'lost' in result.statuses
 
 

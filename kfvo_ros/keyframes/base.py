@@ -17,13 +17,13 @@ class DecisionInput:
     """The state of the window when the newest frame is to be kept or dropped.
 
     ``observation`` as `keyframes.observation` builds it; ``keyframe_tracks`` and
-    ``newest_tracks`` those of the last keyframe and the newest frame (None when neither
+    ``newest_tracks`` those of the last keyframe and the newest frame (empty when neither
     backbone nor policy tracks); ``gap`` counts the input frames between the two.
     """
 
     observation: np.ndarray
-    keyframe_tracks: Tracks | None
-    newest_tracks: Tracks | None
+    keyframe_tracks: Tracks
+    newest_tracks: Tracks
     gap: int
 
 

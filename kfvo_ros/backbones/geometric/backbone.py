@@ -77,12 +77,18 @@ class GeometricBackbone(Backbone):
 
     def estimate(self, windows: Sequence[Window]) -> list[Estimate]:
         """Solve each window."""
-        return [_estimate(window) for window in windows]
+        return [_estimate(window, _stream_of(window)) for window in windows]
 
 
-def _estimate(window: Window) -> Estimate:
+def _stream_of(window: Window) -> GeometricStream:
+    if not isinstance(window.stream, GeometricStream):
+        raise TypeError(f'expected a window of a GeometricStream, came {type(window.stream)}')
+    return window.stream
+
+
+def _estimate(window: Window, stream: GeometricStream) -> Estimate:
     views = tuple(encoded.payload for encoded in window.frames)
-    previous, stream = window.previous, window.stream
+    previous = window.previous
     history = recall(previous, views[0])
     observations = tabulate(history.views + views, len(history.views))
     if observations.mask[:, -1].sum() < MIN_TRACKS:

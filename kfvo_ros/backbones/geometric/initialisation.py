@@ -19,6 +19,8 @@ from kfvo_ros.backbones.geometric.observations import Observations
 
 MIN_PAIR_TRACKS = 12
 """Two frames with fewer common tracks cannot start a window."""
+MIN_FLOW = 2.0
+"""A pair that moved less tells nothing of the relative pose [px]."""
 ENOUGH_TRACKS, ENOUGH_FLOW = 100, 50.0
 """More common tracks, or more flow [px], do not make a pair better."""
 MIN_RESECTION_POINTS = 6
@@ -55,11 +57,16 @@ class Initialiser:
         self._camera = {'model': 'SIMPLE_PINHOLE', 'width': 1, 'height': 1,
                         'params': [focal, 0.0, 0.0]}
 
+    def moved(self, observations: Observations) -> bool:
+        """Return whether the window can be started from nothing."""
+        return self._best_pair(observations) is not None
+
     def from_nothing(self, observations: Observations) -> Guess:
         """Return poses and depths of a window of which nothing is known, median depth 1.
 
         The pair of frames with most tracks and flow gives the first two poses, the others are
-        resected one by one from the points triangulated so far.
+        resected one by one from the points triangulated so far. A camera at rest sees all
+        points at depth 1.
         """
         frames = observations.mask.shape[1]
         T_first_frame = np.tile(np.eye(4), (frames, 1, 1))
@@ -112,7 +119,9 @@ class Initialiser:
                     continue
                 shift = observations.seen[both, i] - observations.seen[both, j]
                 flow = self.focal * float(np.median(np.linalg.norm(shift, axis=1)))
-                score = min(both.sum(), ENOUGH_TRACKS) * (min(flow, ENOUGH_FLOW) + 1e-3)
+                if flow < MIN_FLOW:
+                    continue
+                score = min(both.sum(), ENOUGH_TRACKS) * min(flow, ENOUGH_FLOW)
                 if score > best:
                     best, pair = score, (i, j)
         return pair

@@ -22,7 +22,7 @@ KNOWN_DEPTH_PRIOR = 1.0
 """How strongly a point holds its last depth [px^2 for a depth wrong by 100 %].
 
 It keeps the scale through rotation and hovering, where nothing is measured."""
-NEW_DEPTH_PRIOR = 0.3
+NEW_DEPTH_PRIOR = 0.05
 """The same for new points and the depth around them: they are less certain to have it."""
 LEAST_PRIOR_SPREAD = 0.2
 """The same for points so far away that 100 % of their inverse depth is nothing: this share of
@@ -120,7 +120,8 @@ def solve(observations: Observations, initialiser: Initialiser, previous: Previo
         if solutions[0].newest_inlier_share < SUSPICIOUS_SHARE:
             guess = initialiser.from_previous(observations, previous, history, True)
             solutions.append(_solve_from(observations, focal, guess, anchor))
-    if previous is None or not previous.memory.certain:
+    certain = previous is not None and previous.memory.certain
+    if not solutions or (not certain and initialiser.moved(observations)):
         guess = initialiser.from_nothing(observations)
         solutions.append(_solve_from(observations, focal, guess, anchor))
     return min(solutions, key=lambda solution: solution.cost)
