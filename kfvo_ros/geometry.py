@@ -106,6 +106,21 @@ def orthonormalise(transform: np.ndarray) -> np.ndarray:
     return make_transform(rotation_from_quat_xyzw(quat_xyzw), transform[..., :3, 3])
 
 
+def unit_rays(points: np.ndarray) -> np.ndarray:
+    """Return unit rays (N, 3) through normalised image coordinates (N, 2)."""
+    rays = np.column_stack([points, np.ones(len(points))])
+    return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+
+
+def best_rotation(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Return the rotation (3, 3) that turns vectors `source` (N, 3) closest to `target` (N, 3).
+
+    Source: Kabsch, "A solution for the best rotation to relate two sets of vectors", 1976.
+    """
+    u, _, vt = np.linalg.svd(target.T @ source)
+    return (u * [1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))]) @ vt
+
+
 @dataclass(frozen=True)
 class Similarity:
     """x_target = scale * rotation @ x_source + translation."""

@@ -98,6 +98,7 @@ class KeyframeOdometry:
         self._keyframes: list[Keyframe] = []
         self._newest: Keyframe
         self._pending: list[Placed] = []
+        self._final: list[Placed] = []
         self._known = Knowledge()
         self._previous: Previous | None = None
         self._status = Status.OK
@@ -139,8 +140,9 @@ class KeyframeOdometry:
         There is nothing to decide while the window fills (keep) or for a lost frame (drop).
         """
         if estimate is None:
+            # The first frame is the world; that of a later start is where the last one was lost.
             self._known = Knowledge(self._newest.T_world_camera)
-            self._status, self._covariance = Status.OK, np.zeros((6, 6))
+            self._status = Status.OK if self._newest.index == 0 else Status.LOST
             return True
         scale = 1.0
         if estimate.status is not Status.LOST:
@@ -159,10 +161,10 @@ class KeyframeOdometry:
 
     def commit(self, keep: bool, durations: dict[str, float]) -> Update:
         """Keep or drop the newest frame (step 6) and return what it changed."""
-        newest, final = self._newest, tuple[Placed, ...]()
+        newest = self._newest
         if keep:
             if len(self._keyframes) == self.window_size - 1:
-                final = self._retire(self._keyframes.pop(0))
+                self._retire(self._keyframes.pop(0))
             self._keyframes.append(newest)
             placed = Placed(newest.encoded.stamp_ns, newest, np.eye(4), True)
         else:
@@ -171,6 +173,8 @@ class KeyframeOdometry:
                             geometry.relative(last.T_world_camera, newest.T_world_camera), False)
             self._release(newest)
         self._pending.append(placed)
+        final = tuple(self._final)
+        self._final.clear()
         points = self._known.points
         depth = None if points is None or not len(points.ids) else float(np.median(
             np.linalg.norm(points.positions - newest.T_world_camera[:3, 3], axis=1)))
@@ -214,20 +218,20 @@ class KeyframeOdometry:
         return DecisionInput(observation, last.tracks, self._newest.tracks,
                              self._newest.index - last.index)
 
-    def _retire(self, keyframe: Keyframe) -> tuple[Placed, ...]:
-        """Let a keyframe leave the window; return the frames that hang on it, final now."""
+    def _retire(self, keyframe: Keyframe) -> None:
+        """Let a keyframe leave the window; the frames that hang on it are final now."""
         self._release(keyframe)
         count = 0
         while count < len(self._pending) and self._pending[count].keyframe is keyframe:
             count += 1
-        final, self._pending = tuple(self._pending[:count]), self._pending[count:]
-        return final
+        self._final += self._pending[:count]
+        del self._pending[:count]
 
     def _start_anew(self) -> None:
         """Empty the window: the next frame starts another one where the camera was last seen."""
         self._lost_in_a_row = 0
         for keyframe in self._keyframes:
-            self._release(keyframe)
+            self._retire(keyframe)
         self._keyframes.clear()
 
     def _release(self, frame: Keyframe) -> None:

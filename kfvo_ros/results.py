@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import json
+import re
 import resource
 import sys
 from collections.abc import Iterable
@@ -117,5 +118,11 @@ def evaluate(estimate: Trajectory, truth: GroundTruth | None) -> dict[str, Any]:
 
 def peak_rss_mb() -> float:
     """Return the largest resident memory of this process so far [MiB]."""
+    status = Path('/proc/self/status')
+    if status.exists():
+        # getrusage would count what the parent held before it started this program.
+        peak = re.search(r'VmHWM:\s*(\d+) kB', status.read_text(encoding='ascii'))
+        if peak:
+            return int(peak[1]) / 1024.0
     unit = 1024.0 ** 2 if sys.platform == 'darwin' else 1024.0
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit

@@ -44,8 +44,10 @@ class RollingShutter:
         if len(now) < MIN_TRACKS:
             self._last_field = None
             return tracks.pixels
-        seconds = (stamp_ns - last[0]) / NANOSECONDS
-        measured = (tracks.pixels[now] - last[1].pixels[before]) / seconds
+        motion = tracks.pixels[now] - last[1].pixels[before]
+        # A point that moved down was read later in its frame, so it had more time to move.
+        rows_s = self.camera.readout_s * motion[:, 1:] / self.camera.height
+        measured = motion / ((stamp_ns - last[0]) / NANOSECONDS + rows_s)
         basis = self._basis(tracks.pixels)
         motion_field = _fit_robustly(basis[now], measured)
         velocities = basis @ motion_field

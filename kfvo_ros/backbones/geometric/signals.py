@@ -20,6 +20,8 @@ SIGNAL_NAMES = ('track_survival', 'flow', 'parallax', 'gap', 'baseline_to_depth'
 class Motion:
     """How the newest frame moved against the last keyframe, and against the whole window.
 
+    Parallax is what the best rotation leaves of the flow: a wrong translation cannot feign it.
+
     ``survival`` share of the keyframe's tracks still seen; ``flow`` and ``parallax`` (flow
     after the rotation is taken out), medians [px]; ``window_parallax`` the largest such median
     against any frame of the window [px]; ``gap`` [input frames].
@@ -59,14 +61,12 @@ def signals(solution: Solution, motion: Motion) -> np.ndarray:
 
 
 def _median_shift(solution: Solution, a: int, b: int, focal: float, derotated: bool) -> float:
-    """Return the median image motion from frame a to b [px], zero without common tracks."""
+    """Return the median motion of rays from frame a to b [px], zero without common tracks."""
     observations = solution.observations
     both = observations.mask[:, a] & observations.mask[:, b]
     if not both.any():
         return 0.0
-    before = observations.seen[both, a]
+    before, after = (geometry.unit_rays(observations.seen[both, frame]) for frame in (a, b))
     if derotated:
-        R_b_a = solution.state.rotations[b].T @ solution.state.rotations[a]
-        turned = np.column_stack([before, np.ones(len(before))]) @ R_b_a.T
-        before = turned[:, :2] / np.maximum(turned[:, 2:], 0.1)
-    return focal * float(np.median(np.linalg.norm(observations.seen[both, b] - before, axis=1)))
+        before = before @ geometry.best_rotation(before, after).T
+    return focal * float(np.median(np.linalg.norm(after - before, axis=1)))
