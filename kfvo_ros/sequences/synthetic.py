@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Rendered sequences, ``synthetic:SEED[:smooth|fast|mixed]``: exact poses, no files."""
+"""Rendered sequences, ``synthetic:SEED[:smooth|fast|mixed]``: exact poses without a file."""
 
 from __future__ import annotations
 
@@ -14,94 +14,99 @@ import numpy as np
 from kfvo_ros.camera import Camera
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.sequences.base import Frame, GroundTruth, Sequence
-from kfvo_ros.sequences.rendering import Scene, expose, render
-from kfvo_ros.sequences.synthetic_motion import RATE, STYLES, Path, Waves, move
-from kfvo_ros.sequences.synthetic_textures import Dice
+from kfvo_ros.sequences.exposure import expose
+from kfvo_ros.sequences.rendering import Scene, render
+from kfvo_ros.sequences.synthetic_motion import RATE, Waves, move
+from kfvo_ros.sequences.synthetic_path import Path
+from kfvo_ros.sequences.synthetic_random import Dice
 from kfvo_ros.sequences.synthetic_world import build_scene
 from kfvo_ros.trajectory import NANOSECONDS, Trajectory
 
-FOCAL_PER_WIDTH = 400.0 / 640.0
+STYLES = ('smooth', 'fast', 'mixed')
+MAX_SEED = 2 ** 32 - 1
 START_NS = NANOSECONDS
-"""The first stamp: ROS takes zero for "no time"."""
+"""The first stamp; ROS takes zero for no time at all."""
+FOCAL_PER_WIDTH = 400.0 / 640.0
 GAIN_DRIFT, GAIN_BANDS = 0.05, ((0.05, 0.1), (0.1, 0.2), (0.2, 0.4))
 """The camera's gain drifts by one wave per band [Hz] of this amplitude."""
-MAX_SEED = 2 ** 32 - 1
 
 
 class SyntheticSequence(Sequence):
-    """A camera in a rendered room; see `synthetic_motion.STYLES` for what it does there.
+    """A hand-held camera in a rendered room, 30 Hz, grey; every frame is rendered when asked for.
 
-    The same arguments give the same bytes on every machine; a longer sequence starts with the
-    frames of a shorter one. World z is up, and the first pose is not the identity. Frames are
-    rendered when asked for. Raises KfvoError for arguments out of range.
+    ``smooth`` and ``fast`` are kind to an odometry. ``mixed`` also hovers, creeps and turns on
+    the spot, and with odd seeds it throws the camera about in a bare room. World z is up and
+    the first pose is not the identity. The same arguments give the same bytes on every machine;
+    a longer sequence starts with the frames of a shorter one. Raises KfvoError for arguments
+    out of range.
     """
 
     def __init__(self, seed: int, style: str = 'mixed', frame_count: int = 200,
                  width: int = 640, height: int = 480) -> None:
-        if not 0 <= seed <= MAX_SEED or style not in STYLES or min(frame_count, width,
-                                                                   height) < 1:
+        if not 0 <= seed <= MAX_SEED or style not in STYLES \
+                or min(frame_count, width, height) < 1:
             raise KfvoError(
                 f'expected a seed of 0 to {MAX_SEED}, a style of {", ".join(STYLES)} and '
-                f'positive sizes, came seed {seed}, style {style!r}, {frame_count} frames of '
+                f'positive sizes; came seed {seed}, style {style!r}, {frame_count} frames of '
                 f'{width}x{height}')
         self.name = f'synthetic:{seed}:{style}'
         focal = FOCAL_PER_WIDTH * width
-        self.camera = Camera(width, height, focal, focal, 0.5 * (width - 1), 0.5 * (height - 1))
-        self._seed, self._style, self._frame_count = seed, style, frame_count
+        self.camera: Camera = Camera(width, height, focal, focal, 0.5 * (width - 1), 0.5 * (height - 1))
+        self._seed, self._style, self._length = seed, style, frame_count
+        self._temper = 'hectic' if style == 'mixed' and seed % 2 else style
 
     @property
     def length(self) -> int:
         """Number of frames."""
-        return self._frame_count
+        return self._length
 
     def __iter__(self) -> Iterator[Frame]:
         """Render frame after frame."""
-        return (self.frame(index) for index in range(self._frame_count))
+        return (self.frame(index) for index in range(self._length))
 
     def frame(self, index: int) -> Frame:
-        """Render one frame, grey. Raises IndexError."""
+        """Render any frame; raises IndexError."""
+        index = range(self._length)[index]
         radiance, _ = render(self._scene, self.camera, self._poses[index])
         gain = 1.0 + GAIN_DRIFT * self._gain.at(index)
-        return Frame(_stamp_ns(index), expose(radiance, gain, self._seed << 32 | index),
-                     self.camera)
+        image = expose(radiance, gain, noise_key=self._seed << 32 | index)
+        return Frame(_stamp_ns(index), image, self.camera)
 
     def depth(self, index: int) -> np.ndarray:
-        """Render the depth (H, W) float32 [m] along the optical axis. Raises IndexError."""
+        """Return a frame's depth (H, W) along the optical axis [m]; raises IndexError."""
         return render(self._scene, self.camera, self._poses[index])[1]
 
     def ground_truth(self) -> GroundTruth:
-        """Return the poses that were rendered."""
-        stamps_ns = np.array([_stamp_ns(index) for index in range(self.length)])
+        """Return the poses, T_world_camera, that the frames were rendered with."""
+        stamps_ns = np.array([_stamp_ns(index) for index in range(self._length)], dtype=np.int64)
         return GroundTruth(Trajectory(stamps_ns, self._poses))
 
     @cached_property
-    def _path(self) -> Path:
-        return Path(self._dice(0), self._size)
-
-    @cached_property
     def _poses(self) -> np.ndarray:
-        return np.stack(list(islice(move(self._dice(1), self._style, self._path),
-                                    self._frame_count)))
+        poses = move(self._dice('motion'), self._temper, self._path)
+        return np.stack(list(islice(poses, self._length)))
 
     @cached_property
     def _scene(self) -> Scene:
-        return build_scene(self._dice(2), self._style, self._size, self._path.positions(600))
+        return build_scene(self._dice('scene'), self._temper, self._room_size,
+                           self._path.positions(600))
 
     @cached_property
     def _gain(self) -> Waves:
-        return Waves(self._dice(3), *GAIN_BANDS)
+        return Waves(self._dice('gain'), *GAIN_BANDS)
 
     @property
-    def _size(self) -> tuple[float, float, float]:
-        dice = self._dice(4)
+    def _path(self) -> Path:
+        return Path(self._dice('path'), self._room_size)
+
+    @property
+    def _room_size(self) -> tuple[float, float, float]:
+        dice = self._dice('room')
         return dice.between(6.5, 9.5), dice.between(6.0, 8.0), dice.between(2.6, 3.2)
 
-    def _dice(self, purpose: int) -> Dice:
-        return Dice(self._seed, list(STYLES).index(self._style), purpose)
-
-
-def _stamp_ns(index: int) -> int:
-    return START_NS + index * NANOSECONDS // RATE
+    def _dice(self, purpose: str) -> Dice:
+        purposes = ('room', 'path', 'motion', 'scene', 'gain')
+        return Dice(self._seed, STYLES.index(self._style), purposes.index(purpose))
 
 
 def parse_synthetic(text: str) -> SyntheticSequence:
@@ -111,3 +116,7 @@ def parse_synthetic(text: str) -> SyntheticSequence:
         raise KfvoError(f'expected synthetic:SEED or synthetic:SEED:STYLE, as in '
                         f'synthetic:7:fast, came {text!r}')
     return SyntheticSequence(int(match[1]), match[2] or 'mixed')
+
+
+def _stamp_ns(index: int) -> int:
+    return START_NS + index * NANOSECONDS // RATE

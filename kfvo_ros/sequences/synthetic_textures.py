@@ -1,85 +1,17 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the surfaces of the rendered room look like: painted once per sequence from its seed.
+"""What the surfaces of a rendered room look like.
 
-Only `RandomState.random_sample` is drawn from, whose stream is frozen and which is exact on
-every platform, and only elementwise arithmetic is used: a texture is the same bytes everywhere.
+Every function paints grey values (SIZE, SIZE) that repeat in both directions or, of things that
+are mounted as a whole, fill the square.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
-from kfvo_ros.sequences.rendering import LEVEL_STARTS, TEXTURE_BITS, TEXTURE_SIZE
-
-SIZE = TEXTURE_SIZE
-
-
-class Dice:
-    """Random numbers that are the same for ever."""
-
-    def __init__(self, *key: int) -> None:
-        self._random = np.random.RandomState(list(key))
-
-    def unit(self, *shape: int) -> np.ndarray:
-        """Return numbers of [0, 1)."""
-        return self._random.random_sample(shape)
-
-    def between(self, low: float, high: float) -> float:
-        """Return a number of [low, high)."""
-        return low + (high - low) * float(self._random.random_sample())
-
-    def integer(self, low: int, high: int) -> int:
-        """Return an integer of [low, high)."""
-        return low + int((high - low) * float(self._random.random_sample()))
-
-    def chance(self, probability: float) -> bool:
-        """Return True with a probability."""
-        return self.between(0.0, 1.0) < probability
-
-    def shuffled(self, items: list) -> list:
-        """Return the items in a random order."""
-        return [items[place] for place in np.argsort(self.unit(len(items)), kind='stable')]
-
-
-def build_pyramid(texture: np.ndarray) -> np.ndarray:
-    """Return all levels (LEVEL_STARTS[-1],) uint8 of a texture (SIZE, SIZE), finest first."""
-    level = np.clip(np.floor(texture + 0.5), 0, 255).astype(np.uint16)
-    levels = [level]
-    for _ in range(TEXTURE_BITS):
-        level = (level[::2, ::2] + level[1::2, ::2] + level[::2, 1::2] + level[1::2, 1::2]
-                 + 2) >> 2
-        levels.append(level)
-    pyramid = np.concatenate([level.ravel() for level in levels]).astype(np.uint8)
-    assert len(pyramid) == LEVEL_STARTS[-1]
-    return pyramid
-
-
-def noise(dice: Dice, rows: int, columns: int) -> np.ndarray:
-    """Return smooth periodic noise (SIZE, SIZE) in [-1, 1] with rows x columns random values."""
-    lattice = 2.0 * dice.unit(rows, columns) - 1.0
-
-    def blend(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        place = np.arange(SIZE) * (count / SIZE)
-        before = place.astype(np.int64)
-        share = place - before
-        return before, (before + 1) % count, share * share * (3.0 - 2.0 * share)
-
-    before, after, share = blend(rows)
-    lines = lattice[before] * (1.0 - share[:, None]) + lattice[after] * share[:, None]
-    before, after, share = blend(columns)
-    return lines[:, before] * (1.0 - share) + lines[:, after] * share
-
-
-def fractal(dice: Dice, coarsest: int, finest: int, decay: float) -> np.ndarray:
-    """Return a sum (SIZE, SIZE) of noise from `coarsest` to `finest` cells, doubling."""
-    total, weight, cells = np.zeros((SIZE, SIZE)), 1.0, coarsest
-    while cells <= finest:
-        total += weight * noise(dice, cells, cells)
-        weight, cells = weight * decay, cells * 2
-    return total
+from kfvo_ros.sequences.shading import TEXTURE_SIZE as SIZE
+from kfvo_ros.sequences.synthetic_random import Dice, fractal, noise
 
 
 def plaster(dice: Dice) -> np.ndarray:
@@ -89,9 +21,23 @@ def plaster(dice: Dice) -> np.ndarray:
 
 def concrete(dice: Dice) -> np.ndarray:
     """Return bare concrete with stains and pores."""
-    wall = 120.0 + 26.0 * fractal(dice, 4, 128, 0.8)
-    wall -= 90.0 * np.clip(noise(dice, 128, 128) - 0.72, 0.0, 1.0) * 3.0
+    wall = 120.0 + 22.0 * fractal(dice, 2, 64, 0.6)
+    wall -= 270.0 * np.clip(noise(dice, 128, 128) - 0.8, 0.0, 1.0)
     return wall - 45.0 * np.clip(fractal(dice, 8, 32, 0.7) - 0.7, 0.0, 1.0)
+
+
+def panels(dice: Dice) -> np.ndarray:
+    """Return clean wall panels with thin joints and a few screws: hardly a corner."""
+    wall = np.full((SIZE, SIZE), 150.0) + 3.0 * noise(dice, 4, 4)
+    for joint in (0, 200, 390):
+        wall[joint:joint + 4] = 70.0
+        wall[joint + 4:joint + 6] = 185.0
+    wall[:, :4] = 80.0
+    wall[:, 4:6] = 180.0
+    for row in (16, 184, 216, 374, 406, 496):
+        for column in (18, 256, 490):
+            wall[row:row + 6, column:column + 6] = 85.0
+    return wall
 
 
 def brick(dice: Dice) -> np.ndarray:
@@ -104,7 +50,7 @@ def brick(dice: Dice) -> np.ndarray:
             rows = slice(row * course + joint, (row + 1) * course)
             columns = (np.arange(length - joint) + column * length + shift) % SIZE
             wall[rows, columns] = dice.between(70.0, 125.0)
-    return wall + 16.0 * fractal(dice, 32, 256, 0.8)
+    return wall + 7.0 * fractal(dice, 32, 256, 0.8)
 
 
 def wallpaper(dice: Dice) -> np.ndarray:
@@ -118,7 +64,7 @@ def wallpaper(dice: Dice) -> np.ndarray:
         y % step - step / 2) ** 2
     paper[squared < radius * radius] += dice.between(30.0, 60.0)
     paper[squared < 0.2 * radius * radius] -= 70.0
-    return paper + 12.0 * fractal(dice, 4, 256, 0.85)
+    return paper + 4.0 * fractal(dice, 4, 256, 0.85)
 
 
 def planks(dice: Dice) -> np.ndarray:
@@ -133,9 +79,9 @@ def planks(dice: Dice) -> np.ndarray:
         tone[[start, (start + 1) % SIZE, (start + SIZE // 2) % SIZE]] = 55.0
         floor[rows] = tone
         floor[plank * width:plank * width + 2] = 50.0
-    floor += 14.0 * noise(dice, 256, 8) + 12.0 * noise(dice, 128, 16)
+    floor += 8.0 * noise(dice, 256, 8) + 7.0 * noise(dice, 128, 16)
     knots = np.clip(noise(dice, 32, 32) - 0.75, 0.0, 1.0)
-    return floor - 220.0 * knots + 8.0 * noise(dice, 256, 256)
+    return floor - 220.0 * knots
 
 
 def tiles(dice: Dice) -> np.ndarray:
@@ -144,7 +90,7 @@ def tiles(dice: Dice) -> np.ndarray:
     tone = np.where((np.add.outer(np.arange(8), np.arange(8)) % 2) == 0, 165.0,
                     dice.between(100.0, 155.0)) + 26.0 * (dice.unit(8, 8) - 0.5)
     floor = np.repeat(np.repeat(tone, side, axis=0), side, axis=1)
-    floor += 15.0 * fractal(dice, 16, 256, 0.8)
+    floor += 4.0 * fractal(dice, 16, 256, 0.8)
     joint = np.arange(SIZE) % side < 3
     floor[joint] = floor[:, joint] = 70.0
     return floor
@@ -156,7 +102,7 @@ def carpet(dice: Dice) -> np.ndarray:
     step = SIZE // 4
     ring = np.abs(x % step - step // 2) + np.abs(y % step - step // 2)
     tones = 70.0 + 110.0 * dice.unit(16)
-    return tones[ring // 12] + 14.0 * noise(dice, 256, 256) + 14.0 * fractal(dice, 4, 64, 0.8)
+    return tones[ring // 12] + 6.0 * noise(dice, 256, 256) + 8.0 * fractal(dice, 4, 64, 0.8)
 
 
 def poster(dice: Dice) -> np.ndarray:
@@ -173,7 +119,6 @@ def poster(dice: Dice) -> np.ndarray:
         else:
             sheet[(x - column) ** 2 + (y - row) ** 2 < high * high // 4] = tone
     _write_text(dice, sheet)
-    sheet += 8.0 * fractal(dice, 32, 256, 0.9)
     sheet[:14] = sheet[-14:] = sheet[:, :14] = sheet[:, -14:] = dice.between(20.0, 230.0)
     return sheet
 
@@ -209,12 +154,12 @@ def books(dice: Dice) -> np.ndarray:
             column = column_end + (dice.integer(10, 50) if dice.chance(0.08) else 0)
         case[top + shelf - 8:top + shelf] = 130.0
     case[:, :8] = case[:, -8:] = 130.0
-    return case + 6.0 * fractal(dice, 64, 256, 0.9)
+    return case
 
 
 def door(dice: Dice) -> np.ndarray:
     """Return a panelled door with a handle."""
-    leaf = np.full((SIZE, SIZE), dice.between(110.0, 190.0)) + 9.0 * noise(dice, 16, 256)
+    leaf = np.full((SIZE, SIZE), dice.between(110.0, 190.0)) + 5.0 * noise(dice, 16, 256)
     for top, bottom in ((40, 200), (235, 470)):
         for left in (50, 280):
             panel = leaf[top:bottom, left:left + 180]
@@ -223,7 +168,7 @@ def door(dice: Dice) -> np.ndarray:
             panel[:5] -= 30.0
     leaf[240:262, 462:496] = 40.0
     leaf[:10] = leaf[:, :14] = leaf[:, -14:] = 65.0
-    return leaf + 6.0 * fractal(dice, 32, 256, 0.9)
+    return leaf
 
 
 def window(dice: Dice) -> np.ndarray:
@@ -234,7 +179,7 @@ def window(dice: Dice) -> np.ndarray:
         tone = dice.between(120.0, 195.0)
         view[SIZE - tall:, left:left + wide] = tone
         view[SIZE - tall + 12::24, left + 8:left + wide - 8] = tone - 25.0
-    view += 10.0 * fractal(dice, 16, 128, 0.8)
+    view += 4.0 * fractal(dice, 2, 16, 0.8)
     for bar in (0, SIZE // 3, 2 * SIZE // 3, SIZE - 16):
         view[:, bar:bar + 16] = 165.0
         view[:, bar + 14:bar + 16] = 90.0
@@ -247,7 +192,7 @@ def window(dice: Dice) -> np.ndarray:
 def cupboard(dice: Dice) -> np.ndarray:
     """Return wooden doors and drawers with knobs."""
     front = np.full((SIZE, SIZE), dice.between(80.0, 165.0))
-    front += 13.0 * noise(dice, 8, 128) + 10.0 * noise(dice, 16, 256)
+    front += 7.0 * noise(dice, 8, 128) + 4.0 * noise(dice, 16, 256)
     for top, bottom, columns in ((0, 300, 2), (300, 406, 3), (406, SIZE, 3)):
         wide = SIZE // columns
         front[top:top + 5] = 40.0
@@ -258,12 +203,12 @@ def cupboard(dice: Dice) -> np.ndarray:
             knob = left + (wide // 2 if columns == 3 else (wide - 30 if column == 0 else 30))
             front[row - 9:row + 9, knob - 9:knob + 9] = 215.0
             front[row + 9:row + 13, knob - 9:knob + 9] = 35.0
-    return front + 6.0 * fractal(dice, 32, 256, 0.9)
+    return front
 
 
 def cardboard(dice: Dice) -> np.ndarray:
     """Return the side of a parcel: tape, a label, scuffs."""
-    side = 135.0 + 10.0 * noise(dice, 4, 256) + 12.0 * fractal(dice, 4, 128, 0.8)
+    side = 135.0 + 5.0 * noise(dice, 4, 256) + 6.0 * fractal(dice, 4, 64, 0.7)
     tape = dice.integer(180, 300)
     side[:, tape:tape + 60] += 30.0
     row, column = dice.integer(40, 300), dice.integer(20, 320)
@@ -275,6 +220,3 @@ def cardboard(dice: Dice) -> np.ndarray:
     side[stamp_row + 10:stamp_row + 50, stamp_column + 10:stamp_column + 80] = 130.0
     side[:4] = side[:, :4] = 60.0
     return side
-
-
-Painter = Callable[[Dice], np.ndarray]
