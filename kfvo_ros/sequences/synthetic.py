@@ -51,7 +51,8 @@ class SyntheticSequence(Sequence):
                 f'{width}x{height}')
         self.name = f'synthetic:{seed}:{style}'
         focal = FOCAL_PER_WIDTH * width
-        self.camera: Camera = Camera(width, height, focal, focal, 0.5 * (width - 1), 0.5 * (height - 1))
+        self.camera: Camera = Camera(width, height, focal, focal, 0.5 * (width - 1),
+                                     0.5 * (height - 1))
         self._seed, self._style, self._length = seed, style, frame_count
         self._temper = 'hectic' if style == 'mixed' and seed % 2 else style
 
