@@ -144,9 +144,9 @@ class KeyframeOdometry:
             self._known = Knowledge(self._newest.T_world_camera)
             self._status = Status.OK if self._newest.index == 0 else Status.LOST
             return True
-        scale = 1.0
+        scale, memory_scale = 1.0, self._known.memory_scale
         if estimate.status is not Status.LOST:
-            scale = self.scale.align(estimate, self._previous)
+            scale = memory_scale = self.scale.align(estimate, self._previous)
             self._chain(scaled(estimate.T_anchor_frame, scale))
         self._lost_in_a_row = self._lost_in_a_row + 1 if estimate.status is Status.LOST else 0
         T_world_anchor = self._keyframes[0].T_world_camera
@@ -154,7 +154,7 @@ class KeyframeOdometry:
         self._covariance = turned(estimate.covariance[-1], T_world_anchor, scale)
         self._known = Knowledge(self._newest.T_world_camera,
                                 moved(estimate.points, T_world_anchor, scale), estimate.memory,
-                                scale)
+                                memory_scale)
         if estimate.status is Status.LOST or len(self._keyframes) < self.window_size - 1:
             return estimate.status is not Status.LOST
         return self._decision(estimate)
@@ -183,7 +183,8 @@ class KeyframeOdometry:
 
     def finish(self) -> tuple[Placed, ...]:
         """Return the frames whose poses were not final yet; they are now."""
-        final = tuple(self._pending)
+        final = (*self._final, *self._pending)
+        self._final.clear()
         self._pending.clear()
         return final
 

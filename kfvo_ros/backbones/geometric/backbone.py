@@ -101,7 +101,7 @@ def _estimate(window: Window, stream: GeometricStream) -> Estimate:
     return Estimate(poses[solution.anchor:], solution.covariance(), solution.points(),
                     signals(solution, motion),
                     Status.HELD if motion.window_parallax < HELD_PARALLAX else Status.OK,
-                    Memory(history.views + views, poses,solution.certain))
+                    Memory(history.views + views, poses, solution.certain))
 
 
 def _lost(window: Window) -> Estimate:
