@@ -5,10 +5,19 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+
+from kfvo_ros.threads import single_threaded
+
+
+@pytest.fixture(scope='session', autouse=True)
+def one_thread() -> Iterator[None]:
+    """Solve windows as the commands do: threads of BLAS that wait for each other cost minutes."""
+    with single_threaded():
+        yield
 
 
 @pytest.fixture(scope='session')
