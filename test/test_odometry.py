@@ -56,7 +56,7 @@ def test_trajectory_follows_the_truth(frames, survival):
     error = metrics.absolute_trajectory_error(survival.trajectory, truth)
     assert error.rmse < 0.01 * error.path_length
     turned = metrics.relative_pose_error(survival.trajectory, truth, 10, 'frames')
-    assert turned.rot_rmse_deg < 0.5
+    assert turned.rot_rmse_deg < 0.8  # [deg] over 10 frames at 320x240
     assert set(survival.statuses) == {'ok'}
 
 

@@ -68,7 +68,8 @@ def test_names_and_cameras(tmp_path):
                                   (-0.28, 0.07, 0.0002, 1.8e-05))),
         'tum': ('rgbd_dataset_freiburg1_test', Camera(
             640, 480, 517.306408, 516.469215, 318.643040, 255.313989, 'plumb_bob',
-            (0.262383, -0.953104, -0.005358, 0.002628, 1.163314)).scaled(WIDTH, HEIGHT)),
+            (0.262383, -0.953104, -0.005358, 0.002628, 1.163314),
+            readout_s=0.030).scaled(WIDTH, HEIGHT)),
         'kitti': ('kitti/03', Camera(WIDTH, HEIGHT, 30.0, 30.0, 16.0, 12.0)),
         'tartanair': ('hospital/Easy/P000',
                       Camera(640, 480, 320.0, 320.0, 320.0, 240.0).scaled(WIDTH, HEIGHT))}

@@ -36,8 +36,10 @@ def noise(seed: int) -> np.ndarray:
 def test_tracks_keep_their_ids_and_are_in_order(images):
     tracker = Tracker()
     before, largest = Tracks(), -1
-    for image in images:
+    for index, image in enumerate(images):
         tracks = tracker.track(image)
+        if index == 8:
+            assert (tracks.ids < 300).sum() > 20  # some live long
         assert tracks.ids.dtype == np.int64
         assert tracks.pixels.shape == (len(tracks), 2)
         assert (np.diff(tracks.ids) > 0).all()
@@ -48,19 +50,18 @@ def test_tracks_keep_their_ids_and_are_in_order(images):
         assert (tracks.pixels < np.array(image.shape[::-1]) - BORDER // 2).all()
         before = tracks
     assert len(tracks) > 80
-    assert (tracks.ids < 300).sum() > 20  # some live long
 
 
 def test_tracks_follow_the_scene():
-    sequence = SyntheticSequence(3, 'smooth', 8, 320, 240)
+    sequence = SyntheticSequence(3, 'smooth', 5, 320, 240)
     camera, poses = sequence.camera, sequence.ground_truth().trajectory.poses
     tracker = Tracker()
-    tracks = [tracker.track(sequence.frame(index).image) for index in range(8)]
-    first, last = common(tracks[0], tracks[7])
+    tracks = [tracker.track(sequence.frame(index).image) for index in range(5)]
+    first, last = common(tracks[0], tracks[4])
     x, y = first.round().astype(int).T
     depth = sequence.depth(0)[y, x]
     rays = np.column_stack([camera.undistort(first), np.ones(len(first))])
-    T_last_first = geometry.relative(poses[7], poses[0])
+    T_last_first = geometry.relative(poses[4], poses[0])
     points = (rays * depth[:, None]) @ T_last_first[:3, :3].T + T_last_first[:3, 3]
     expected = camera.distort(points[:, :2] / points[:, 2:])
     errors = np.linalg.norm(last - expected, axis=1)
