@@ -16,7 +16,7 @@ from kfvo_ros.backbones.geometric.memory import History
 from kfvo_ros.backbones.geometric.observations import Observations
 
 ITERATIONS, FINAL_ITERATIONS = 8, 4
-MAX_ERROR = 3.0
+MAX_ERROR = 2.0
 """Observations farther off after the first adjustment are outliers [px]."""
 KNOWN_DEPTH_PRIOR = 1.0
 """How strongly a point holds its last depth [px^2 for a depth wrong by 100 %].
@@ -29,8 +29,8 @@ LEAST_PRIOR_SPREAD = 0.2
 the median's."""
 SUSPICIOUS_SHARE = 0.7
 """When fewer of the newest frame's tracks fit, its first place may have been wrong."""
-MIN_INFORMATION = 100.0
-"""The median depth is known to 10 % from tracks good to a pixel: worth to be held on to."""
+MIN_INFORMATION = 30.0
+"""The median depth is known to 18 % from tracks good to a pixel: worth to be held on to."""
 LEAST_NOISE = 0.1
 """Tracks are never believed to be better than this [px]."""
 
