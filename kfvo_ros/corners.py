@@ -21,7 +21,7 @@ BORDER = 8
 """No corner lies this close to the rim [px]."""
 HARRIS = 0.04
 """Points whose gradients point one way, along an edge, are no corners: a track would slide."""
-MIN_RESPONSE, TINY_RESPONSE = 1e-6, 1e-6
+MIN_RESPONSE, TINY_RESPONSE = 3e-4, 1e-6
 """A corner's response must reach this share of the image's strongest, which is none if tiny."""
 
 MAX_SHIFT = 5

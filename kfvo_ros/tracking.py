@@ -18,7 +18,7 @@ from kfvo_ros.camera import Camera
 from kfvo_ros.corners import find_corners
 from kfvo_ros.motion_field import MotionField
 
-FEATURES = 500
+FEATURES = 400
 CLAHE_CLIP, CLAHE_TILES = 3.0, (8, 8)
 RIM = 4
 """Tracks end this close to the rim [px]."""
