@@ -29,6 +29,8 @@ NEWTON_STEPS = 15
 
 MAX_VIEW_ANGLE = math.radians(80.0)
 """Rays farther off the axis have no usable pinhole coordinates."""
+MAX_READOUT = 0.2
+"""No shutter rolls longer than this [s]: what comes is probably in milliseconds."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +70,9 @@ class Camera:
                 or min(self.width, self.height) <= 0:
             raise KfvoError(f'expected positive sizes and focal lengths, came {self.width}x'
                             f'{self.height} fx={self.fx} fy={self.fy}; is it calibrated?')
+        if not 0.0 <= self.readout_s < MAX_READOUT:
+            raise KfvoError(f'expected a readout time of 0 to {MAX_READOUT} s, came '
+                            f'readout_s={self.readout_s}')
         object.__setattr__(self, 'distortion_model', model)
         object.__setattr__(self, 'distortion', coefficients)
 
@@ -157,6 +162,7 @@ def guess_camera(width: int, height: int) -> Camera:
 def read_camera_info(path: Path) -> Camera:
     """Read a calibration in the form that ROS' camera_calibration writes.
 
+    An extra key ``readout_s`` says how long a rolling shutter takes from first to last row [s].
     Raises KfvoError naming the file and the key that is missing or wrong.
     """
     try:
@@ -168,7 +174,8 @@ def read_camera_info(path: Path) -> Camera:
         fx, _, cx, _, fy, cy = _matrix(document, 'camera_matrix', 9)[:6]
         return Camera(int(document['image_width']), int(document['image_height']), fx, fy, cx,
                       cy, str(document.get('distortion_model', 'none')),
-                      _matrix(document, 'distortion_coefficients', None))
+                      _matrix(document, 'distortion_coefficients', None),
+                      readout_s=float(document.get('readout_s', 0.0)))
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise KfvoError(f'{path}: expected a ROS camera calibration with image_width, '
                         f'image_height, camera_matrix, distortion_model and '

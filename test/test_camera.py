@@ -159,6 +159,7 @@ def test_zero_coefficients_are_no_distortion():
     ({'distortion_model': 'none'}, 'distortion coefficients'),
     ({'fx': 0.0}, 'fx=0.0'), ({'fy': -5.0}, 'fy=-5.0'), ({'fx': math.nan}, 'fx=nan'),
     ({'cx': math.inf}, 'expected'), ({'distortion': (math.nan,) * 4}, 'expected'),
+    ({'readout_s': 30.0}, 'readout_s=30.0'), ({'readout_s': math.nan}, 'readout_s=nan'),
     ({'width': 0}, 'came 0x480'), ({'height': -1}, 'came 640x-1')])
 def test_impossible_cameras_are_refused(change, problem):
     values = {'width': 640, 'height': 480, 'fx': 500.0, 'fy': 500.0, 'cx': 320.0, 'cy': 240.0,
@@ -218,6 +219,8 @@ def test_a_calibration_is_read(tmp_path):
     path.write_text(CALIBRATION)
     assert read_camera_info(path) == Camera(640, 480, 517.3, 516.5, 318.6, 255.3, 'plumb_bob',
                                             (0.26, -0.95, -0.005, 0.0026, 1.16))
+    path.write_text(CALIBRATION + 'readout_s: 0.03\n')
+    assert read_camera_info(path).readout_s == 0.03
 
 
 @pytest.mark.parametrize('old, new, problem', [
@@ -231,6 +234,7 @@ def test_a_calibration_is_read(tmp_path):
     ('517.3', 'nan', 'is it calibrated|could not convert'),
     ('plumb_bob', 'wobbly', "unknown distortion model 'wobbly'"),
     ('1.16', '1.16, 1, 2', 'distortion coefficients, 7 came'),
+    ('image_width: 640', 'image_width: 640\nreadout_s: 30', 'readout_s=30.0'),
     ('distortion_coefficients', 'd', "KeyError\\('distortion_coefficients'\\)"),
     ('{rows: 1, cols: 5, data: [0.26,', '[[0.26,', 'cannot read the calibration'),
     ('image_width: 640', '!!python/object/apply:os.getcwd []', 'cannot read the calibration'),

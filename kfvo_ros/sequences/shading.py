@@ -46,7 +46,7 @@ class View(NamedTuple):
 
 def build_pyramid(texture: np.ndarray) -> np.ndarray:
     """Return all levels, flat and uint8, of grey values (TEXTURE_SIZE, TEXTURE_SIZE)."""
-    level = np.clip(np.floor(texture + 0.5), 0.0, 255.0).astype(np.uint16)
+    level: np.ndarray = np.clip(np.floor(texture + 0.5), 0.0, 255.0).astype(np.uint16)
     levels = [level.ravel()]
     for _ in range(TEXTURE_BITS):
         level = (level[::2, ::2] + level[1::2, ::2] + level[::2, 1::2] + level[1::2, 1::2]

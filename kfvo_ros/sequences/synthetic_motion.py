@@ -88,7 +88,7 @@ def move(dice: Dice, temper: str, path: Path) -> Iterator[np.ndarray]:
 def _plan(dice: Dice, temper: str) -> Iterator[tuple[Targets, float]]:
     """Yield, per frame, what to aim at and the gaze's response."""
     yaw = pitch = roll = 0.0
-    groups = DECKS[temper][:1]
+    groups = list(DECKS[temper][:1])
     while True:
         for activity in (activity for group in groups for activity in group):
             speed, gaze = dice.between(*activity.speed), math.radians(
