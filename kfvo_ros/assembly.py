@@ -61,4 +61,4 @@ def parse_transform(text: str | None) -> np.ndarray | None:
         numbers = np.zeros(0)
     if len(numbers) != 7 or not np.isfinite(numbers).all() or np.linalg.norm(numbers[3:]) < 1e-3:
         raise KfvoError(f'expected seven numbers "x y z qx qy qz qw", came {text!r}')
-    return geometry.make_transform(geometry.rotation_from_quat_xyzw(numbers[3:]), numbers[:3])
+    return geometry.transform_from_xyz_quat(numbers)

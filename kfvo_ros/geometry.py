@@ -100,6 +100,11 @@ def rotation_from_quat_xyzw(quat_xyzw: np.ndarray) -> np.ndarray:
     return np.eye(3) + 2.0 * scalar * generator + 2.0 * (generator @ generator)
 
 
+def transform_from_xyz_quat(values: np.ndarray) -> np.ndarray:
+    """Return T (..., 4, 4) of ``x y z qx qy qz qw`` (..., 7), as text and messages hold poses."""
+    return make_transform(rotation_from_quat_xyzw(values[..., 3:]), values[..., :3])
+
+
 def orthonormalise(transform: np.ndarray) -> np.ndarray:
     """Return T (..., 4, 4) with an exact rotation; products of many drift away from one."""
     quat_xyzw = quat_xyzw_from_rotation(transform[..., :3, :3])

@@ -16,6 +16,7 @@ import numpy as np
 
 from kfvo_ros import geometry
 from kfvo_ros.errors import KfvoError
+from kfvo_ros.text_rows import parse_floats, read_rows
 
 NANOSECONDS = 1_000_000_000
 ASSOCIATION_LIMIT_NS = 10_000_000
@@ -120,22 +121,10 @@ def read_tum(path: Path) -> Trajectory:
 
     Raises KfvoError naming the first line that is not eight numbers.
     """
-    stamps_ns, rows = [], []
-    for number, line in _data_lines(path):
-        try:
-            stamp, *fields = line.replace(',', ' ').split()
-            stamps_ns.append(parse_stamp_ns(stamp))
-            row = [float(field) for field in fields]
-        except ValueError:
-            row = []
-        if len(row) != 7 or not np.isfinite(row).all() or np.linalg.norm(row[3:]) < 1e-3:
-            raise KfvoError(f'{path}, line {number}: expected "stamp tx ty tz qx qy qz qw", '
-                            f'found {line[:80]!r}')
-        rows.append(row)
-    values = np.array(rows, dtype=np.float64).reshape(-1, 7)
-    rotations = geometry.rotation_from_quat_xyzw(values[:, 3:])
-    return Trajectory(np.array(stamps_ns, dtype=np.int64),
-                      geometry.make_transform(rotations, values[:, :3]))
+    rows = read_rows(path, 'stamp tx ty tz qx qy qz qw', _parse_stamped_pose)
+    values = np.array([row for _, row in rows], dtype=np.float64).reshape(-1, 7)
+    return Trajectory(np.array([stamp_ns for stamp_ns, _ in rows], dtype=np.int64),
+                      geometry.transform_from_xyz_quat(values))
 
 
 def read_kitti_poses(path: Path, stamps_ns: np.ndarray) -> Trajectory:
@@ -145,15 +134,7 @@ def read_kitti_poses(path: Path, stamps_ns: np.ndarray) -> Trajectory:
     Raises KfvoError when a line is not 12 numbers with a rotation in them, or the file is not
     one pose per stamp.
     """
-    rows = []
-    for number, line in _data_lines(path):
-        try:
-            row = [float(field) for field in line.split()]
-        except ValueError:
-            row = []
-        if len(row) != 12 or not np.isfinite(row).all():
-            raise KfvoError(f'{path}, line {number}: expected 12 numbers, found {line[:80]!r}')
-        rows.append(row)
+    rows = read_rows(path, '12 numbers', lambda line: parse_floats(line.split(), 12))
     if len(rows) != len(stamps_ns):
         raise KfvoError(f'{path} holds {len(rows)} poses for {len(stamps_ns)} frames; '
                         'expected one line per frame')
@@ -167,11 +148,9 @@ def read_kitti_poses(path: Path, stamps_ns: np.ndarray) -> Trajectory:
     return Trajectory(np.asarray(stamps_ns, dtype=np.int64), poses)
 
 
-def _data_lines(path: Path) -> list[tuple[int, str]]:
-    """Return (line number, text) of the lines that are neither empty nor comments."""
-    try:
-        text = Path(path).read_text(encoding='utf-8')
-    except (OSError, UnicodeDecodeError) as error:
-        raise KfvoError(f'cannot read {path}: {error}') from error
-    stripped = ((number, line.strip()) for number, line in enumerate(text.splitlines(), 1))
-    return [(number, line) for number, line in stripped if line and not line.startswith('#')]
+def _parse_stamped_pose(line: str) -> tuple[int, list[float]]:
+    stamp, *fields = line.replace(',', ' ').split()
+    row = parse_floats(fields, 7)
+    if np.linalg.norm(row[3:]) < 1e-3:
+        raise ValueError('no rotation')
+    return parse_stamp_ns(stamp), row

@@ -237,7 +237,7 @@ def test_kitti_rotations_are_rotations_despite_few_digits(tmp_path):
 def test_a_bad_kitti_line_is_named(tmp_path, line):
     path = tmp_path / '03.txt'
     path.write_text(f'1 0 0 0 0 1 0 0 0 0 1 0\n{line}\n')
-    with pytest.raises(KfvoError, match='03.txt, line 2: expected 12 numbers'):
+    with pytest.raises(KfvoError, match='03.txt, line 2: expected "12 numbers"'):
         read_kitti_poses(path, np.arange(2))
 
 

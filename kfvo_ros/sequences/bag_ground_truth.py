@@ -104,9 +104,8 @@ def _read_trajectory(bag: Bag, topic: str, edge: Edge | None) -> tuple[str, Traj
             stamps_ns.append(stamp_ns)
             rows.append(row)
     values = np.array(rows, dtype=np.float64).reshape(-1, 7)
-    poses = geometry.make_transform(geometry.rotation_from_quat_xyzw(values[:, 3:]),
-                                    values[:, :3])
-    trajectory = Trajectory(np.array(stamps_ns, dtype=np.int64), poses,
+    trajectory = Trajectory(np.array(stamps_ns, dtype=np.int64),
+                            geometry.transform_from_xyz_quat(values),
                             has_rotation=bag.topics[topic] != POINT)
     return body, trajectory
 

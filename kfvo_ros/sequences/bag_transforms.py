@@ -62,8 +62,8 @@ class TransformTree:
     def _parents(self) -> dict[str, tuple[str, np.ndarray]]:
         """Return child -> (parent, T_parent_child) of the fixed edges."""
         first, moving = self._edges
-        return {child: (parent, _matrix(values)) for (parent, child), values in first.items()
-                if (parent, child) not in moving}
+        return {child: (parent, geometry.transform_from_xyz_quat(values))
+                for (parent, child), values in first.items() if (parent, child) not in moving}
 
     def _ancestors(self, frame: str) -> dict[str, np.ndarray]:
         """Return T_ancestor_frame by ancestor, nearest first, beginning with the frame."""
@@ -86,7 +86,3 @@ def _values(transform: Any) -> np.ndarray:
     """Return (tx, ty, tz, qx, qy, qz, qw) of a geometry_msgs/Transform."""
     t, q = transform.translation, transform.rotation
     return np.array([t.x, t.y, t.z, q.x, q.y, q.z, q.w])
-
-
-def _matrix(values: np.ndarray) -> np.ndarray:
-    return geometry.make_transform(geometry.rotation_from_quat_xyzw(values[3:]), values[:3])

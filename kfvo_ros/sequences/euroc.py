@@ -21,7 +21,7 @@ from kfvo_ros.sequences.base import GroundTruth
 from kfvo_ros.sequences.calibration import Calibration, rigid_transform
 from kfvo_ros.sequences.image_list import ImageListSequence
 from kfvo_ros.sequences.kind import Kind, Options
-from kfvo_ros.sequences.text_rows import parse_floats, read_rows
+from kfvo_ros.text_rows import parse_floats, read_rows
 from kfvo_ros.trajectory import Trajectory
 
 
@@ -83,9 +83,8 @@ def _read_ground_truth(root: Path, sensor_file: Path) -> GroundTruth | None:
         return None
     rows = read_rows(path, 'timestamp [ns], p x y z, q w x y z, ...', _parse_pose)
     values = np.array([row for _, row in rows]).reshape(-1, 7)
-    rotations = geometry.rotation_from_quat_xyzw(values[:, [4, 5, 6, 3]])
     body = Trajectory(np.array([stamp_ns for stamp_ns, _ in rows], dtype=np.int64),
-                      geometry.make_transform(rotations, values[:, :3]))
+                      geometry.transform_from_xyz_quat(values[:, [0, 1, 2, 4, 5, 6, 3]]))
     extrinsics = _read_sensor(sensor_file).get('T_BS')
     if not isinstance(extrinsics, dict):
         raise KfvoError(f'{sensor_file}: expected T_BS with 16 numbers under data')

@@ -20,7 +20,7 @@ from kfvo_ros.sequences.base import GroundTruth
 from kfvo_ros.sequences.calibration import Calibration
 from kfvo_ros.sequences.image_list import IMAGE_SUFFIXES, ImageListSequence
 from kfvo_ros.sequences.kind import Kind, Options
-from kfvo_ros.sequences.text_rows import parse_floats, read_rows
+from kfvo_ros.text_rows import parse_floats, read_rows
 from kfvo_ros.trajectory import parse_stamp_ns, read_kitti_poses
 
 IMAGE_FOLDERS = {'image_0': 'P0', 'image_2': 'P2'}

@@ -20,7 +20,7 @@ from kfvo_ros.sequences.base import GroundTruth
 from kfvo_ros.sequences.calibration import Calibration
 from kfvo_ros.sequences.image_list import ImageListSequence, list_images, stamps_at_rate
 from kfvo_ros.sequences.kind import Kind, Options
-from kfvo_ros.sequences.text_rows import parse_floats, read_rows
+from kfvo_ros.text_rows import parse_floats, read_rows
 from kfvo_ros.trajectory import Trajectory
 
 CAMERA = Camera(640, 480, 320.0, 320.0, 320.0, 240.0)

@@ -17,7 +17,7 @@ from kfvo_ros.sequences.base import GroundTruth
 from kfvo_ros.sequences.calibration import Calibration
 from kfvo_ros.sequences.image_list import ImageListSequence
 from kfvo_ros.sequences.kind import Kind, Options
-from kfvo_ros.sequences.text_rows import read_rows
+from kfvo_ros.text_rows import read_rows
 from kfvo_ros.trajectory import parse_stamp_ns, read_tum
 
 KINECT_READOUT = 0.030
