@@ -11,7 +11,7 @@ import numpy as np
 from kfvo_ros import geometry
 from kfvo_ros.backbones.geometric import kernels
 
-HUBER = 0.5
+HUBER = 0.8
 """Reprojection errors beyond it count linearly [px]."""
 FIRST_DAMPING, LEAST_DAMPING = 1e-4, 1e-7
 DAMPING_DOWN, DAMPING_UP = 0.2, 8.0
