@@ -148,11 +148,10 @@ class Tracker:
                       np.concatenate([survivors.pixels, corners]))
 
 
-
 def _ransac(seed: int) -> cv2.UsacParams:
     """Return MAGSAC's parameters: as many inliers as poselib's estimator in a quarter of time."""
     params = cv2.UsacParams()
-    params.randomGeneratorState = seed
+    params.randomGeneratorState = seed % (1 << 31)  # OpenCV's is a C int.
     params.threshold = MAX_EPIPOLAR_ERROR
     params.confidence = RANSAC_CONFIDENCE
     params.maxIterations = RANSAC_ITERATIONS

@@ -79,6 +79,12 @@ def test_number_of_features_can_be_chosen(images):
     assert 35 <= len(Tracker(features=40).track(images[0])) <= 40
 
 
+def test_any_seed_is_a_seed(images):
+    tracker = Tracker(seed=2 ** 40)
+    for image in images[:3]:
+        assert len(tracker.track(image)) > 50
+
+
 def test_same_images_same_bytes(images):
     one, other = Tracker(), Tracker()
     for image in images[:8]:
