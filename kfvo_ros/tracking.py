@@ -149,7 +149,7 @@ class Tracker:
 
 
 def _ransac(seed: int) -> cv2.UsacParams:
-    """Return MAGSAC's parameters: as many inliers as poselib's estimator in a quarter of time."""
+    """Return the parameters of MAGSAC."""
     params = cv2.UsacParams()
     params.randomGeneratorState = seed % (1 << 31)  # OpenCV's is a C int.
     params.threshold = MAX_EPIPOLAR_ERROR

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from odometry_scenes import frames_of
 
-from kfvo_ros import geometry
+from kfvo_ros import geometry, optical_flow
 from kfvo_ros.camera import Camera
 from kfvo_ros.corners import MIN_DISTANCE
 from kfvo_ros.sequences.synthetic import SyntheticSequence
@@ -63,6 +63,32 @@ def test_tracks_follow_the_scene():
     assert np.linalg.norm(last - first, axis=1).mean() > 5.0
     assert np.median(errors) < 0.5
     assert np.percentile(errors, 85) < 2.0  # a rounded corner may take the depth behind it
+
+
+def true_error(sequence: SyntheticSequence, gap: int) -> float:
+    """Return the median error [px] of tracks after `gap` frames, by the rendered depth."""
+    camera, poses = sequence.camera, sequence.ground_truth().trajectory.poses
+    tracker = Tracker(camera)
+    tracks = [tracker.track(frame.image) for frame in sequence]
+    errors = []
+    for index in range(len(tracks) - gap):
+        first, last = common(tracks[index], tracks[index + gap])
+        column, row = first.round().astype(int).T
+        rays = np.column_stack([camera.undistort(first), np.ones(len(first))])
+        points = rays * sequence.depth(index)[row, column, None]
+        T_last_first = geometry.relative(poses[index + gap], poses[index])
+        moved = points @ T_last_first[:3, :3].T + T_last_first[:3, 3]
+        expected = camera.distort(moved[:, :2] / moved[:, 2:])
+        errors.append(np.median(np.linalg.norm(last - expected, axis=1)))
+    return float(np.mean(errors))
+
+
+def test_narrow_patches_follow_the_point_itself(monkeypatch):
+    """Wide ones average over surfaces that move differently, and drift with them."""
+    sequence = SyntheticSequence(0, 'smooth', 16)
+    narrow = true_error(sequence, 4)
+    monkeypatch.setitem(optical_flow.REFINEMENT, 'winSize', optical_flow.SEARCH['winSize'])
+    assert narrow < 0.8 * true_error(sequence, 4)
 
 
 def test_corners_are_many_and_spread():

@@ -18,8 +18,6 @@ HISTORY = 8
 A window of eight frames forgets what it knew of depth; these long baselines are what keeps the
 scale. They are final and cost no unknowns.
 """
-
-
 MAX_SHARED = 0.8
 """A keyframe joins the history when it shares fewer tracks with the one before it there."""
 
