@@ -25,7 +25,9 @@ MODEL_SYNONYMS = {'': 'none', 'none': 'none', 'pinhole': 'none', 'plumb_bob': 'p
                   'fisheye': 'equidistant'}
 
 NEWTON_STEPS = 15
-"""An ordinary lens takes four, the corners of a wide one eight."""
+"""An ordinary lens takes three, the corners of a wide one eight."""
+CONVERGED = 1e-7
+"""Steps square: after one of this size the error is some 1e-14."""
 
 MAX_VIEW_ANGLE = math.radians(80.0)
 """Rays farther off the axis have no usable pinhole coordinates."""
@@ -120,7 +122,7 @@ class Camera:
                 determinant = a * d - b * c
                 step = np.column_stack([d * u - b * v, a * v - c * u]) / determinant[:, None]
                 points = points + step
-                if not np.any(np.abs(step) > 1e-13):
+                if not np.any(np.abs(step) > CONVERGED):
                     break
         return np.where(determinant[:, None] > 0.0, points, np.nan)
 

@@ -37,10 +37,12 @@ def relative(T_w_a: np.ndarray, T_w_b: np.ndarray) -> np.ndarray:
 
 def skew(vector: np.ndarray) -> np.ndarray:
     """Return [v]x (..., 3, 3), so that [v]x u = v x u."""
-    x, y, z = np.moveaxis(np.asarray(vector, dtype=np.float64), -1, 0)
-    zero = np.zeros_like(x)
-    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    vector = np.asarray(vector, dtype=np.float64)
+    matrix = np.zeros((*vector.shape, 3))
+    for axis, (row, column) in enumerate(((2, 1), (0, 2), (1, 0))):
+        matrix[..., row, column] = vector[..., axis]
+        matrix[..., column, row] = -vector[..., axis]
+    return matrix
 
 
 def exp_so3(rotation_vector: np.ndarray) -> np.ndarray:

@@ -103,9 +103,10 @@ def reprojection_errors(problem: Problem, state: State) -> np.ndarray:
 def cost(problem: Problem, state: State) -> float:
     """Return the Huber cost [px^2] of observations and priors."""
     errors = reprojection_errors(problem, state)
-    robust = np.where(errors < HUBER, errors ** 2, HUBER * (2.0 * errors - HUBER))
-    prior = problem.prior_weights * (state.inverse_depths - problem.prior_values) ** 2
-    return float(robust.sum() + prior.sum())
+    quadratic = np.minimum(errors, HUBER)
+    away = state.inverse_depths - problem.prior_values
+    return float(np.vdot(quadratic, 2.0 * errors - quadratic)
+                 + problem.prior_weights @ (away * away))
 
 
 def linearise(problem: Problem, state: State) -> NormalEquations:

@@ -25,7 +25,7 @@ MIN_DEPTH = 1e-3
 BEHIND_ERROR = 100.0
 """... and counts as this many pixels off."""
 
-_compiled = numba.njit(cache=True, nogil=True)
+_compiled = numba.njit(cache=True, nogil=True, error_model='numpy')
 
 
 @_compiled
@@ -100,7 +100,10 @@ def _differentiate(rotations, translations, h, j, ray, b, r, p, focal, J, J_dept
 @_compiled
 def _accumulate(J, J_depth, e0, e1, weight, first_host, first_seen, k, H_cc, g_c, H_pc, H_pp,
                 g_p):
-    """Add one observation to the normal equations; rows of fixed frames are negative."""
+    """Add one observation to the normal equations; rows of fixed frames are negative.
+
+    A host comes before the frames that see it, so this fills H_cc below its diagonal.
+    """
     H_pp[k] += weight * (J_depth[0] ** 2 + J_depth[1] ** 2)
     g_p[k] += weight * (J_depth[0] * e0 + J_depth[1] * e1)
     for m in range(12):
@@ -110,10 +113,11 @@ def _accumulate(J, J_depth, e0, e1, weight, first_host, first_seen, k, H_cc, g_c
         w0, w1 = weight * J[0, m], weight * J[1, m]
         g_c[row] += w0 * e0 + w1 * e1
         H_pc[k, row] += w0 * J_depth[0] + w1 * J_depth[1]
-        for n in range(6):
-            if first_host >= 0:
+        if first_host >= 0:
+            for n in range(6):
                 H_cc[row, first_host + n] += w0 * J[0, n] + w1 * J[1, n]
-            if first_seen >= 0:
+        if m >= 6:
+            for n in range(6):
                 H_cc[row, first_seen + n] += w0 * J[0, n + 6] + w1 * J[1, n + 6]
 
 
@@ -148,6 +152,8 @@ def linearise(rotations, translations, inverse_depths, hosts, rays, seen, mask, 
             _differentiate(rotations, translations, h, j, ray, rays[k], r, p, focal, J, J_depth)
             _accumulate(J, J_depth, e0, e1, weight, 6 * (h - fixed), 6 * (j - fixed), k, H_cc,
                         g_c, H_pc, H_pp, g_p)
+    for row in range(size):
+        H_cc[row, row + 1:] = H_cc[row + 1:, row]
     return H_cc, g_c, H_pc, H_pp, g_p
 
 

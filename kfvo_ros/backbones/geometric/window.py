@@ -27,7 +27,7 @@ NEW_DEPTH_PRIOR = 0.05
 LEAST_PRIOR_SPREAD = 0.2
 """The same for points so far away that 100 % of their inverse depth is nothing: this share of
 the median's."""
-SUSPICIOUS_SHARE = 0.7
+SUSPICIOUS_SHARE = 0.5
 """When fewer of the newest frame's tracks fit, its first place may have been wrong."""
 MIN_INFORMATION = 30.0
 """The median depth is known to 18 % from tracks good to a pixel: worth to be held on to."""
@@ -48,7 +48,6 @@ class Solution:
     inliers: np.ndarray
     errors: np.ndarray
     normal: ba.NormalEquations
-    cost: float
 
     @property
     def solved(self) -> np.ndarray:
@@ -62,11 +61,6 @@ class Solution:
             geometry.make_transform(self.state.rotations, self.state.translations))
         poses[self.anchor] = np.eye(4)
         return poses
-
-    @property
-    def newest_inlier_share(self) -> float:
-        """Share of the newest frame's observations that fit."""
-        return float(self.inliers[:, -1].sum()) / max(1, self.observations.mask[:, -1].sum())
 
     @property
     def certain(self) -> bool:
@@ -113,33 +107,52 @@ def solve(observations: Observations, initialiser: Initialiser, previous: Previo
     which may sit in a wrong minimum.
     """
     anchor, focal = len(history.views), initialiser.focal
-    solutions = []
+    drafts = []
     if previous is not None and previous.points is not None:
         guess = initialiser.from_previous(observations, previous, history)
-        solutions.append(_solve_from(observations, focal, guess, anchor))
-        if solutions[0].newest_inlier_share < SUSPICIOUS_SHARE:
+        drafts.append(_draft(observations, focal, guess, anchor))
+        if drafts[0].newest_inlier_share < SUSPICIOUS_SHARE:
             guess = initialiser.from_previous(observations, previous, history, True)
-            solutions.append(_solve_from(observations, focal, guess, anchor))
+            drafts.append(_draft(observations, focal, guess, anchor))
     certain = previous is not None and previous.memory.certain
-    if not solutions or (not certain and initialiser.moved(observations)):
+    if not drafts or (not certain and initialiser.moved(observations)):
         guess = initialiser.from_nothing(observations)
-        solutions.append(_solve_from(observations, focal, guess, anchor))
-    return min(solutions, key=lambda solution: solution.cost)
+        drafts.append(_draft(observations, focal, guess, anchor))
+    return _finish(observations, min(drafts, key=lambda draft: draft.cost), anchor)
 
 
-def _solve_from(observations: Observations, focal: float, guess: Guess,
-                anchor: int) -> Solution:
-    """Adjust, take out the outliers, adjust again."""
+@dataclass(frozen=True)
+class _Draft:
+    """A window adjusted with all its observations, of which ``inliers`` (P, F) fit."""
+
+    problem: ba.Problem
+    state: ba.State
+    inliers: np.ndarray
+    cost: float
+
+    @property
+    def newest_inlier_share(self) -> float:
+        """Share of the newest frame's observations that fit."""
+        return float(self.inliers[:, -1].sum()) / max(1, self.problem.mask[:, -1].sum())
+
+
+def _draft(observations: Observations, focal: float, guess: Guess, anchor: int) -> _Draft:
+    """Adjust from a guess and tell the outliers."""
     problem = _problem(observations, focal, guess, anchor + 1)
     state = ba.adjust(problem, guess.state, ITERATIONS)
-    first_cost = ba.cost(problem, state)
     inliers = observations.mask & (ba.reprojection_errors(problem, state) <= MAX_ERROR)
     inliers &= (inliers.sum(axis=1) >= 2)[:, None]
-    if (inliers != observations.mask).any():
-        problem = problem.observed(inliers)
+    return _Draft(problem, state, inliers, ba.cost(problem, state))
+
+
+def _finish(observations: Observations, draft: _Draft, anchor: int) -> Solution:
+    """Adjust again without the outliers."""
+    problem, state = draft.problem, draft.state
+    if (draft.inliers != observations.mask).any():
+        problem = problem.observed(draft.inliers)
         state = ba.adjust(problem, state, FINAL_ITERATIONS)
-    return Solution(observations, anchor, state, inliers, ba.reprojection_errors(problem, state),
-                    ba.linearise(problem, state), first_cost)
+    return Solution(observations, anchor, state, draft.inliers,
+                    ba.reprojection_errors(problem, state), ba.linearise(problem, state))
 
 
 def _problem(observations: Observations, focal: float, guess: Guess, fixed: int) -> ba.Problem:
