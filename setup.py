@@ -51,7 +51,7 @@ setup(
         'console_scripts': [
             'kfvo_run = kfvo_ros.run:main',
             'kfvo_node = kfvo_ros.commands:not_in_this_version',
-            'kfvo_convert = kfvo_ros.commands:not_in_this_version',
+            'kfvo_convert = kfvo_ros.convert:main',
             'kfvo_play = kfvo_ros.commands:not_in_this_version',
             'kfvo_train = kfvo_ros.commands:not_in_this_version',
             'kfvo_benchmark = kfvo_ros.commands:not_in_this_version',

@@ -64,6 +64,8 @@ class Camera:
         coefficients = tuple(float(value) for value in self.distortion)
         if model != 'equidistant' and not any(coefficients):
             model, coefficients = 'none', ()
+        if model == 'plumb_bob' and len(coefficients) == 4:
+            coefficients += (0.0,)  # in ROS it always has a k3
         if len(coefficients) not in DISTORTION_SIZES[model]:
             raise KfvoError(f'{model} takes {DISTORTION_SIZES[model]} distortion coefficients, '
                             f'{len(coefficients)} came')
@@ -82,6 +84,18 @@ class Camera:
     def matrix(self) -> np.ndarray:
         """K (3, 3)."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def projection(self) -> np.ndarray:
+        """P (3, 4) of a camera that is one of its own, not the right one of a pair: [K 0]."""
+        return np.column_stack([self.matrix, np.zeros(3)])
+
+    @property
+    def ros_distortion(self) -> tuple[str, tuple[float, ...]]:
+        """Model and coefficients in CameraInfo, which has no word for a lens without any."""
+        none = ('plumb_bob', (0.0,) * 5)
+        return none if self.distortion_model == 'none' else (self.distortion_model,
+                                                             self.distortion)
 
     def undistort(self, pixels: np.ndarray) -> np.ndarray:
         """Return undistorted normalised coordinates (N, 2) of pixels (N, 2).
@@ -184,6 +198,24 @@ def read_camera_info(path: Path) -> Camera:
                         f'distortion_coefficients; problem: {error!r}') from error
     except KfvoError as error:
         raise KfvoError(f'{path}: {error}') from error
+
+
+def write_camera_info(path: Path, camera: Camera) -> None:
+    """Write the calibration for `read_camera_info`; raises KfvoError naming the file."""
+    model, coefficients = camera.ros_distortion
+    matrices = {'camera_matrix': camera.matrix, 'rectification_matrix': np.eye(3),
+                'projection_matrix': camera.projection,
+                'distortion_coefficients': np.array([coefficients])}
+    document = {'image_width': camera.width, 'image_height': camera.height,
+                'camera_name': 'camera', 'distortion_model': model,
+                'readout_s': camera.readout_s,
+                **{key: {'rows': matrix.shape[0], 'cols': matrix.shape[1],
+                         'data': matrix.ravel().tolist()} for key, matrix in matrices.items()}}
+    text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None)
+    try:
+        path.write_text(text, encoding='utf-8')
+    except OSError as error:
+        raise KfvoError(f'cannot write the calibration {path}: {error.strerror}') from error
 
 
 def _matrix(document: dict[str, Any], key: str, size: int | None) -> tuple[float, ...]:

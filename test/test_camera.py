@@ -135,13 +135,18 @@ def test_matrix_projects():
 
 
 @pytest.mark.parametrize('name, count, model', [
-    ('plumb_bob', 5, 'plumb_bob'), ('radtan', 4, 'plumb_bob'),
-    ('radial-tangential', 4, 'plumb_bob'), (' Plumb_Bob ', 4, 'plumb_bob'),
+    ('plumb_bob', 5, 'plumb_bob'), ('radtan', 5, 'plumb_bob'),
+    ('radial-tangential', 5, 'plumb_bob'), (' Plumb_Bob ', 5, 'plumb_bob'),
     ('rational_polynomial', 8, 'rational_polynomial'), ('equidistant', 4, 'equidistant'),
     ('fisheye', 4, 'equidistant'), ('pinhole', 0, 'none'), ('none', 0, 'none'), ('', 0, 'none')])
 def test_models_have_synonyms(name, count, model):
     camera = Camera(4, 4, 1.0, 1.0, 2.0, 2.0, name, (0.1,) * count)
     assert (camera.distortion_model, len(camera.distortion)) == (model, count)
+
+
+def test_plumb_bob_always_has_a_k3():
+    four = Camera(4, 4, 1.0, 1.0, 2.0, 2.0, 'radtan', (0.1, 0.2, 0.3, 0.4))
+    assert four == Camera(4, 4, 1.0, 1.0, 2.0, 2.0, 'plumb_bob', (0.1, 0.2, 0.3, 0.4, 0.0))
 
 
 def test_zero_coefficients_are_no_distortion():

@@ -26,13 +26,14 @@ from kfvo_ros.requirements import PIP_NAMES, missing_dependency
 ROOT = Path(__file__).resolve().parent.parent
 SOURCES = sorted((ROOT / 'kfvo_ros').rglob('*.py'))
 COMMANDS = {'kfvo_node', 'kfvo_run', 'kfvo_convert', 'kfvo_play', 'kfvo_train', 'kfvo_benchmark'}
+BUILT_COMMANDS = {'kfvo_run', 'kfvo_convert'}
 HEADER = ['# Copyright 2026 The kfvo_ros authors', '# SPDX-License-Identifier: Apache-2.0']
 BUILT = ('.git', '.venv*', '*.egg-info', '__pycache__', '.*_cache', 'build', 'install', 'log',
          'demo')
 
 # Rooms by floor, the ground first; modules that are not named stand on the ground.
 FLOORS = ((), ('sequences',), ('backbones',), ('keyframes',), ('knowledge', 'odometry', 'scale'),
-          ('assembly', 'options', 'results'), ('commands', 'run'))
+          ('assembly', 'options', 'recording', 'results'), ('commands', 'convert', 'run'))
 HEAVY = ('rclpy', 'torch', 'scipy', 'stable_baselines3')
 MAY_BE_HEAVY = ('kfvo_ros.ros', 'kfvo_ros.learning', 'kfvo_ros.backbones.vggt')
 
@@ -200,13 +201,14 @@ def test_installed_files(workspace: Path) -> None:
         assert os.access(script, os.X_OK)
 
 
-def test_installed_command_starts(workspace: Path) -> None:
-    outcome = start(workspace, 'kfvo_run', '--help')
+@pytest.mark.parametrize('command', sorted(BUILT_COMMANDS))
+def test_installed_command_starts(workspace: Path, command: str) -> None:
+    outcome = start(workspace, command, '--help')
     assert outcome.returncode == 0, outcome.stderr
     assert 'synthetic:SEED' in outcome.stdout
 
 
-@pytest.mark.parametrize('command', sorted(COMMANDS - {'kfvo_run'}))
+@pytest.mark.parametrize('command', sorted(COMMANDS - BUILT_COMMANDS))
 def test_command_to_come_says_so(workspace: Path, command: str) -> None:
     outcome = start(workspace, command)
     assert outcome.returncode == 1

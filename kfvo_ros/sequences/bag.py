@@ -18,7 +18,8 @@ from kfvo_ros.images import decode_compressed, decode_image
 from kfvo_ros.sequences.bag_camera import read_bag_camera
 from kfvo_ros.sequences.bag_ground_truth import read_bag_ground_truth
 from kfvo_ros.sequences.bag_reader import BAG_SUFFIXES, COMPRESSED_IMAGE, IMAGE, Bag, stamp_of
-from kfvo_ros.sequences.base import Frame, GroundTruth, Sequence
+from kfvo_ros.sequences.bag_transforms import TransformTree
+from kfvo_ros.sequences.base import BODY_FRAME, FixedTransform, Frame, GroundTruth, Sequence
 from kfvo_ros.sequences.calibration import Calibration, rigid_transform
 from kfvo_ros.sequences.kind import Kind, Options
 from kfvo_ros.trajectory import format_stamp
@@ -47,7 +48,8 @@ class BagSequence(Sequence):
             self.topic = _choose_image_topic(bag, options.image_topic)
             self._length = bag.count(self.topic)
             first = bag.first(self.topic)
-            self._camera_frame = first.header.frame_id.lstrip('/')
+            self._frame_id = first.header.frame_id.lstrip('/')
+            self.camera_frame = self._frame_id or self.camera_frame
             height, width = self._decode(first).shape[:2]
             folder = path if path.is_dir() else path.parent
             calibration = Calibration(options.camera, folder,
@@ -78,7 +80,14 @@ class BagSequence(Sequence):
         """Return the measured trajectory, read at the call, or None where there is none."""
         with Bag(self._path) as bag:
             return read_bag_ground_truth(bag, self._ground_truth_topic, self._T_body_camera,
-                                         self._camera_frame)
+                                         self._frame_id)
+
+    def extrinsics(self) -> tuple[FixedTransform, ...]:
+        """Return the transform that was given, else the bag's from its root to the camera."""
+        if self._T_body_camera is not None:
+            return (FixedTransform(BODY_FRAME, self.camera_frame, self._T_body_camera),)
+        with Bag(self._path) as bag:
+            return tuple(reversed(TransformTree(bag).carriers(self._frame_id)))
 
     def _decode(self, message: Any) -> np.ndarray:
         """Return the pixels of an Image or CompressedImage; KfvoError names bag and stamp."""

@@ -18,18 +18,27 @@ def read_bag_camera(bag: Bag, image_topic: str, width: int, height: int) -> Came
     CameraInfo is looked for beside the images (/cam0/image_raw: /cam0/camera_info). Topics with
     ``rect`` in their name are rectified: their camera is P, without distortion.
     """
-    namespace, _, image_name = image_topic.removesuffix('/compressed').rpartition('/')
-    info_topic = f'{namespace}/camera_info'
+    info_topic = camera_info_topic(image_topic)
     if bag.topics.get(info_topic) != CAMERA_INFO:
         return None
     info = bag.first(info_topic)
     if bag.is_ros1:  # whose message calls them K, D and P
         info = SimpleNamespace(**{name.lower(): value for name, value in vars(info).items()})
     try:
-        return camera_from_info(info, 'rect' in image_name, width, height)
+        return camera_from_info(info, is_rectified(image_topic), width, height)
     except KfvoError as error:
         raise KfvoError(f'{bag.path}, {info_topic}: {error}; '
                         'or give the calibration with --camera') from error
+
+
+def camera_info_topic(image_topic: str) -> str:
+    """Return the topic of the CameraInfo beside raw or compressed images."""
+    return f"{_raw(image_topic).rpartition('/')[0]}/camera_info"
+
+
+def is_rectified(image_topic: str) -> bool:
+    """Return whether the images of a topic are rectified, by its last name."""
+    return 'rect' in _raw(image_topic).rpartition('/')[2]
 
 
 def camera_from_info(info: Any, rectified: bool, width: int, height: int) -> Camera | None:
@@ -53,3 +62,7 @@ def camera_from_info(info: Any, rectified: bool, width: int, height: int) -> Cam
         return Camera(width, height, fx, fy, cx, cy)
     return Camera(width, height, fx, fy, cx, cy, info.distortion_model,
                   tuple(float(value) for value in info.d))
+
+
+def _raw(image_topic: str) -> str:
+    return image_topic.removesuffix('/compressed')

@@ -11,6 +11,7 @@ import numpy as np
 
 from kfvo_ros import geometry
 from kfvo_ros.sequences.bag_reader import TRANSFORMS, Bag
+from kfvo_ros.sequences.base import FixedTransform
 
 Edge = tuple[str, str]
 """(parent, child)."""
@@ -43,6 +44,19 @@ class TransformTree:
                 return geometry.relative(T_x_target[common], T_x_source[common])
         return None
 
+    def carriers(self, frame: str) -> list[FixedTransform]:
+        """Return the fixed transforms on which a frame hangs, the nearest first."""
+        found: list[FixedTransform] = []
+        seen = {frame}
+        while frame in self._parents:
+            parent, T_parent_child = self._parents[frame]
+            if parent in seen:  # a loop, which only a broken recording has
+                break
+            found.append(FixedTransform(parent, frame, T_parent_child))
+            seen.add(parent)
+            frame = parent
+        return found
+
     @cached_property
     def _edges(self) -> tuple[dict[Edge, np.ndarray], set[Edge]]:
         """Return the first values of every edge, and the edges whose values change."""
@@ -68,12 +82,8 @@ class TransformTree:
     def _ancestors(self, frame: str) -> dict[str, np.ndarray]:
         """Return T_ancestor_frame by ancestor, nearest first, beginning with the frame."""
         found = {frame: np.eye(4)}
-        while frame in self._parents:
-            parent, T_parent_frame = self._parents[frame]
-            if parent in found:  # a loop, which only a broken recording has
-                break
-            found[parent] = T_parent_frame @ found[frame]
-            frame = parent
+        for carrier in self.carriers(frame):
+            found[carrier.parent] = carrier.T_parent_child @ found[carrier.child]
         return found
 
 

@@ -13,6 +13,9 @@ import numpy as np
 from kfvo_ros.camera import Camera
 from kfvo_ros.trajectory import Trajectory
 
+BODY_FRAME = 'body'
+"""The rig that carries the camera, where the source does not name it."""
+
 
 @dataclass(frozen=True)
 class Frame:
@@ -38,14 +41,26 @@ class GroundTruth:
     frame: str = 'camera'
 
 
+@dataclass(frozen=True)
+class FixedTransform:
+    """How one named frame is mounted on another: T_parent_child (4, 4)."""
+
+    parent: str
+    child: str
+    T_parent_child: np.ndarray
+
+
 class Sequence(ABC):
     """Frames of one camera in time order, read lazily; iterate as often as you like.
 
     ``name`` is for people (``kitti/03``). ``camera`` may be None when nobody calibrated it.
+    ``topic`` and ``camera_frame`` are what ROS calls its raw images and their optical frame.
     """
 
     name: str
     camera: Camera | None
+    topic: str = '/camera/image_raw'
+    camera_frame: str = 'camera_optical_frame'
 
     @abstractmethod
     def __iter__(self) -> Iterator[Frame]:
@@ -59,3 +74,7 @@ class Sequence(ABC):
     def ground_truth(self) -> GroundTruth | None:
         """Return the measured trajectory, read at the call, or None where there is none."""
         return None
+
+    def extrinsics(self) -> tuple[FixedTransform, ...]:
+        """Return what carries the camera: none, or transforms from the body to camera_frame."""
+        return ()

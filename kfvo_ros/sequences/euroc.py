@@ -33,7 +33,8 @@ def open_euroc(path: Path, options: Options) -> ImageListSequence:
     images = read_rows(root / 'cam0' / 'data.csv', 'timestamp [ns],filename', _parse_image)
     calibration = Calibration(options.camera, folder, partial(_read_camera, sensor_file))
     return ImageListSequence(folder.name, root / 'cam0' / 'data', images, calibration,
-                             partial(_read_ground_truth, root, sensor_file))
+                             partial(_read_ground_truth, root, sensor_file),
+                             partial(_read_extrinsics, sensor_file))
 
 
 def _matches(path: Path) -> bool:
@@ -85,10 +86,20 @@ def _read_ground_truth(root: Path, sensor_file: Path) -> GroundTruth | None:
     values = np.array([row for _, row in rows]).reshape(-1, 7)
     body = Trajectory(np.array([stamp_ns for stamp_ns, _ in rows], dtype=np.int64),
                       geometry.transform_from_xyz_quat(values[:, [0, 1, 2, 4, 5, 6, 3]]))
+    T_body_camera = _read_extrinsics(sensor_file)
+    if T_body_camera is None:
+        raise KfvoError(f'{sensor_file}: expected T_BS with 16 numbers under data')
+    return GroundTruth(body.moved(T_body_camera))
+
+
+def _read_extrinsics(sensor_file: Path) -> np.ndarray | None:
+    """Read T_BS, which is T_body_camera, None where there is none."""
+    if not sensor_file.is_file():
+        return None
     extrinsics = _read_sensor(sensor_file).get('T_BS')
     if not isinstance(extrinsics, dict):
-        raise KfvoError(f'{sensor_file}: expected T_BS with 16 numbers under data')
-    return GroundTruth(body.moved(rigid_transform(extrinsics.get('data'), f'{sensor_file}, T_BS')))
+        return None
+    return rigid_transform(extrinsics.get('data'), f'{sensor_file}, T_BS')
 
 
 def _parse_pose(line: str) -> tuple[int, list[float]]:

@@ -11,10 +11,12 @@ from collections.abc import Callable, Iterable, Iterator
 from fractions import Fraction
 from pathlib import Path
 
+import numpy as np
+
 from kfvo_ros.camera import Camera
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.images import read_image
-from kfvo_ros.sequences.base import Frame, GroundTruth, Sequence
+from kfvo_ros.sequences.base import BODY_FRAME, FixedTransform, Frame, GroundTruth, Sequence
 from kfvo_ros.sequences.calibration import Calibration
 from kfvo_ros.trajectory import NANOSECONDS
 
@@ -35,11 +37,13 @@ class ImageListSequence(Sequence):
 
     def __init__(self, name: str, folder: Path, images: Iterable[tuple[int, str]],
                  calibration: Calibration,
-                 ground_truth: Callable[[], GroundTruth | None] = lambda: None) -> None:
+                 ground_truth: Callable[[], GroundTruth | None] = lambda: None,
+                 T_body_camera: Callable[[], np.ndarray | None] = lambda: None) -> None:
         self.name = name
         self._folder = folder
         self._images = _in_time_order(name, images)
         self._read_ground_truth = ground_truth
+        self._read_T_body_camera = T_body_camera
         if not self._images:
             raise KfvoError(f'{name}: expected images in {folder}, none is listed')
         height, width = read_image(folder / self._images[0][1]).shape[:2]
@@ -64,6 +68,12 @@ class ImageListSequence(Sequence):
     def ground_truth(self) -> GroundTruth | None:
         """Return the measured trajectory, read at the call, or None where there is none."""
         return self._read_ground_truth()
+
+    def extrinsics(self) -> tuple[FixedTransform, ...]:
+        """Return where the camera is on the body, read at the call, where the dataset says it."""
+        T_body_camera = self._read_T_body_camera()
+        return () if T_body_camera is None else (
+            FixedTransform(BODY_FRAME, self.camera_frame, T_body_camera),)
 
 
 def list_images(folder: Path) -> list[str]:

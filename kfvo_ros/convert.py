@@ -1,0 +1,142 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""``python -m kfvo_ros.convert SEQUENCE BAG``: any sequence to a recording of ROS 2."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+import shlex
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+from kfvo_ros import __version__
+from kfvo_ros.errors import KfvoError
+
+EXAMPLES = """examples:
+  python -m kfvo_ros.convert V1_01_easy bags/V1_01 --topic /cam0/image_raw
+  python -m kfvo_ros.convert MH_01_easy.bag bags/MH_01 --camera config/euroc_cam0.yaml
+  python -m kfvo_ros.convert rgbd_dataset_freiburg1_desk bags/fr1_desk --compressed
+
+The bag is a folder with an MCAP file and metadata.yaml. It holds the images of one camera, its
+CameraInfo unless that was guessed, ground truth and /tf_static where the sequence has them; what
+else a bag recorded, an IMU or other cameras, stays behind. Bag time is the stamp of the images.
+"""
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; return its exit status."""
+    logging.basicConfig(format='kfvo_convert: %(levelname)s: %(message)s', level=logging.WARNING)
+    try:
+        return _convert(argv)
+    except ModuleNotFoundError as error:
+        from kfvo_ros.requirements import missing_dependency
+        problem: Exception = missing_dependency(error)
+    except KfvoError as error:
+        problem = error
+    except KeyboardInterrupt:
+        problem = KfvoError('interrupted before the first image')
+    print(f'kfvo_convert: error: {problem}', file=sys.stderr)
+    return 1
+
+
+def _convert(argv: list[str] | None) -> int:
+    # The heavy imports come after the arguments were checked: --help answers at once.
+    arguments = _parse(argv)
+    from kfvo_ros.options import SequenceOptions, from_arguments
+    from kfvo_ros.recording.bag_writer import BagWriter
+    options = from_arguments(SequenceOptions, arguments)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    writer = BagWriter(Path(os.path.abspath(arguments.bag)), arguments.zstd,
+                       arguments.metadata_version)
+    from kfvo_ros.assembly import make_sequence
+    from kfvo_ros.recording.recorder import Recorder
+    sequence = make_sequence(arguments.sequence, options)
+    recorder = Recorder(sequence, writer, arguments.topic, arguments.compressed)
+    with _interrupts_held() as interrupts:
+        problem = _record(sequence, recorder, options.stop, interrupts)
+        if recorder.frame_count == 0:
+            writer.discard()
+            raise KfvoError(problem or f'{sequence.name} has no images')
+        recorder.finish(complete=not problem and recorder.frame_count != options.stop)
+    print(_describe(writer, recorder, arguments.bag))
+    if problem:
+        print(f'kfvo_convert: error: {problem}; the {recorder.frame_count} images before that are '
+              f'in {arguments.bag}', file=sys.stderr)
+    return 1 if problem else 0
+
+
+def _parse(argv: list[str] | None) -> argparse.Namespace:
+    from kfvo_ros.options import SequenceOptions, add_arguments
+    from kfvo_ros.recording import CODECS
+    parser = argparse.ArgumentParser(
+        prog='kfvo_convert', description='Write any sequence as a bag that "ros2 bag play" plays.',
+        epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('sequence', help='dataset folder, ROS 1 or 2 bag, folder of images, '
+                        'video, or synthetic:SEED[:smooth|fast|mixed]')
+    parser.add_argument('bag', help='folder to create; an existing one is never touched')
+    parser.add_argument('--topic', help='topic of the images (default: that of the bag they come '
+                        'from, else /camera/image_raw)')
+    parser.add_argument('--compressed', nargs='?', const=CODECS[0], choices=CODECS,
+                        help='write CompressedImage; png, which loses nothing, unless jpeg is '
+                        'asked for')
+    parser.add_argument('--zstd', action='store_true', help='compress the chunks of the file')
+    parser.add_argument('--metadata-version', type=int, choices=(8, 9), default=9,
+                        help='8 for ROS 2 before Jazzy (default: 9)')
+    parser.add_argument('--version', action='version', version=f'kfvo_ros {__version__}')
+    add_arguments(parser, SequenceOptions)
+    return parser.parse_args(argv)
+
+
+@contextmanager
+def _interrupts_held() -> Iterator[list[int]]:
+    """Collect Ctrl-C and SIGTERM instead of raising: no message is cut in the middle."""
+    received: list[int] = []
+    previous = {number: signal.signal(number, lambda number, _: received.append(number))
+                for number in (signal.SIGINT, signal.SIGTERM)
+                if signal.getsignal(number) != signal.SIG_IGN}  # as nohup and & want it
+    try:
+        yield received
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+def _record(sequence: Any, recorder: Any, stop: int | None, interrupts: list[int]) -> str | None:
+    """Write the frames; return why it ended before the end, if it did."""
+    from tqdm import tqdm
+    total = sequence.length if stop is None else min(stop, sequence.length or stop)
+    try:
+        for frame in tqdm(islice(sequence, stop), total=total, unit='image', desc=sequence.name):
+            if interrupts:
+                return 'interrupted'
+            recorder.write(frame)
+    except KfvoError as error:
+        return str(error)
+    return None
+
+
+def _describe(writer: Any, recorder: Any, bag: str) -> str:
+    """Return the few lines a person wants to see at the end."""
+    width = max(map(len, writer.topics))
+    lines = [f'{topic:{width}}  {written.messages} x {written.message_type.replace("/msg/", "/")}'
+             for topic, written in sorted(writer.topics.items())]
+    if recorder.camera is None:
+        lines.append('no CameraInfo: nobody calibrated this camera; give --camera')
+    elif recorder.camera.readout_s > 0.0:
+        lines.append('camera_info.yaml in it has the rolling shutter, which CameraInfo cannot say')
+    size_mb = sum(path.stat().st_size for path in writer.path.iterdir()) / 1e6
+    lines.append(f'{bag}: {recorder.frame_count} images, {size_mb:.1f} MB; replay it by')
+    lines += [f'  {player} {shlex.quote(bag)}'
+              for player in ('ros2 bag play', 'python -m kfvo_ros.play')]
+    return '\n'.join(lines)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,134 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""``python -m kfvo_ros.convert`` as users start it: errors, interruption, nothing overwritten."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from bag_writers import COUNT
+from recordings import assert_same, write_sequence
+
+import kfvo_ros
+from kfvo_ros.sequences import open_sequence
+from kfvo_ros.sequences.synthetic import SyntheticSequence
+
+ENVIRONMENT = os.environ | {'PYTHONPATH': str(Path(kfvo_ros.__file__).parents[1])}
+
+
+def command(*arguments: object) -> subprocess.CompletedProcess:
+    return subprocess.run([sys.executable, '-m', 'kfvo_ros.convert', *map(str, arguments)],
+                          capture_output=True, text=True, env=ENVIRONMENT, timeout=60)
+
+
+def assert_one_readable_line(done: subprocess.CompletedProcess, *parts: str) -> None:
+    assert done.returncode != 0 and 'Traceback' not in done.stderr + done.stdout
+    line, = (line for line in done.stderr.splitlines() if 'error:' in line)
+    assert all(part in line for part in parts), line
+
+
+@pytest.mark.parametrize('taken', ['folder', 'file', 'dead link'])
+def test_nothing_is_overwritten_nor_read(taken, tmp_path):
+    bag = tmp_path / 'out'
+    {'folder': bag.mkdir, 'file': bag.touch,
+     'dead link': lambda: bag.symlink_to('nowhere')}[taken]()
+    assert_one_readable_line(command('/no/such/sequence', bag), str(bag), 'exists already')
+    assert list(tmp_path.iterdir()) == [bag]
+
+
+@pytest.mark.parametrize(('arguments', 'parts'), [
+    (['/no/such/place'], ['/no/such/place', 'does not exist']),
+    (['synthetic:7', '--kind', 'nothing'], ['nothing', 'euroc']),
+    (['synthetic:7', '--metadata-version', '7'], ['7', '8, 9']),
+    (['synthetic:7', '--compressed', 'gif'], ['gif', 'png', 'jpeg']),
+    (['synthetic:7', '--topic', 'my images'], ['my images', '/camera/image_raw']),
+    (['synthetic:7', '--topic', '/a//b'], ['/a//b']),
+    (['synthetic:7', '--topic', '/camera/camera_info'], ['/camera/camera_info', '--topic']),
+    (['synthetic:7', '--topic', '/ground_truth/odometry'], ['/ground_truth/odometry']),
+    (['tum', '--topic', '/camera/image_rect'], ['/camera/image_rect', 'rectified']),
+    (['broken'], ['0.png']),
+    (['synthetic:7', '--stop', '0'], ['at least 1']),
+])
+def test_what_cannot_be_leaves_nothing_behind(arguments, parts, tmp_path):
+    if arguments[0] == 'tum':
+        arguments = [write_sequence('tum', tmp_path), *arguments[1:]]
+    if arguments[0] == 'broken':
+        arguments = [write_sequence('folder', tmp_path)]
+        Path(arguments[0], '0.png').write_bytes(b'no image')
+    assert_one_readable_line(command(*arguments, tmp_path / 'a' / 'out'), *parts)
+    assert not (tmp_path / 'a').exists()
+
+
+def test_an_output_that_cannot_be(tmp_path):
+    source = write_sequence('folder', tmp_path)
+    (tmp_path / 'file').touch()
+    assert_one_readable_line(command(source, tmp_path / 'file' / 'out'), 'file/out')
+    assert_one_readable_line(command(source, tmp_path / 'out.mcap'), 'out.mcap', 'folder')
+
+
+def test_times_that_ros_cannot_express(tmp_path):
+    source = write_sequence('tum', tmp_path)
+    index = Path(source, 'rgb.txt')
+    lines = index.read_text().splitlines()
+    lines[-1] = '5000000000.0 ' + lines[-1].split()[1]
+    index.write_text('\n'.join(lines))
+    done = command(source, tmp_path / 'out')
+    assert_one_readable_line(done, '5000000000.000000000', '2038', f'{COUNT - 1} images')
+    assert len(list(open_sequence(str(tmp_path / 'out')))) == COUNT - 1
+
+
+def test_a_broken_image_in_the_middle_keeps_the_earlier_ones(tmp_path):
+    source = write_sequence('euroc', tmp_path)
+    original = open_sequence(source)
+    third = sorted(Path(source).rglob('*.png'))[3]
+    third.write_bytes(b'no image at all')
+    done = command(source, tmp_path / 'out')
+    assert_one_readable_line(done, third.name, '3 images before', str(tmp_path / 'out'))
+    copy = open_sequence(str(tmp_path / 'out'))
+    assert len(list(copy)) == len(copy.ground_truth().trajectory) == 3
+    assert copy.camera == original.camera
+
+
+def test_a_full_disk(tmp_path):
+    """A limit on the size of files stands in for it: writing fails in the same place."""
+    script = ('import resource, sys; from kfvo_ros.convert import main; '
+              'resource.setrlimit(resource.RLIMIT_FSIZE, (2 << 20, 2 << 20)); sys.exit(main())')
+    done = subprocess.run([sys.executable, '-c', script, 'synthetic:7', str(tmp_path / 'out'),
+                           '--stop', '20'], capture_output=True, text=True, env=ENVIRONMENT,
+                          timeout=60)
+    assert_one_readable_line(done, 'cannot write', str(tmp_path / 'out'), 'incomplete')
+
+
+@pytest.mark.parametrize('sent', [signal.SIGINT, signal.SIGTERM])
+def test_interruption_keeps_what_was_written(sent, tmp_path):
+    bag = tmp_path / 'out'
+    process = subprocess.Popen([sys.executable, '-m', 'kfvo_ros.convert', 'synthetic:7', str(bag)],
+                               stderr=subprocess.PIPE, text=True, env=ENVIRONMENT)
+    try:
+        patience = time.monotonic() + 60.0
+        while not (bag.exists() and any(file.stat().st_size > 1 << 20 for file in bag.iterdir())):
+            assert time.monotonic() < patience
+            time.sleep(0.02)
+        process.send_signal(sent)
+        _, problems = process.communicate(timeout=30)
+    finally:
+        process.kill()
+    assert process.returncode == 1 and 'Traceback' not in problems
+    copy = open_sequence(str(bag))
+    assert f'interrupted; the {copy.length} images before' in problems.splitlines()[-1]
+    assert 3 <= copy.length < 200
+    assert_same(SyntheticSequence(7), copy, copy.length)
+
+
+
+
+def test_help():
+    done = command('--help')
+    assert done.returncode == 0
+    assert all(word in done.stdout for word in ('--compressed', '--zstd', '--metadata-version'))
