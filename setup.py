@@ -52,7 +52,7 @@ setup(
             'kfvo_run = kfvo_ros.run:main',
             'kfvo_node = kfvo_ros.commands:not_in_this_version',
             'kfvo_convert = kfvo_ros.convert:main',
-            'kfvo_play = kfvo_ros.commands:not_in_this_version',
+            'kfvo_play = kfvo_ros.play:main',
             'kfvo_train = kfvo_ros.commands:not_in_this_version',
             'kfvo_benchmark = kfvo_ros.commands:not_in_this_version',
         ],

@@ -17,10 +17,10 @@ Options = TypeVar('Options')
 
 
 def option(default: Any, description: str, choices: tuple[str, ...] = (),
-           least: float | None = None, most: float | None = None) -> Any:
-    """Declare one field: its default, what it does, and what it may be."""
+           least: float | None = None, most: float | None = None, bare: Any = None) -> Any:
+    """Declare one field: its default, what it does, what it may be, and what no value means."""
     return field(default=default, metadata={'description': description, 'choices': choices,
-                                            'least': least, 'most': most})
+                                            'least': least, 'most': most, 'bare': bare})
 
 
 @dataclass(frozen=True)
@@ -58,24 +58,52 @@ class SequenceOptions:
     stop: int | None = option(None, 'stop after so many frames', least=1)
 
 
+@dataclass(frozen=True)
+class PlayOptions:
+    """What of a bag is played, and how."""
+
+    topic: tuple[str, ...] = option(
+        (), 'play only this topic; may be given several times. Default: all topics, but of '
+        'several image topics only the first by name')
+    rate: float = option(1.0, 'speed; 2 is twice as fast as recorded', least=1e-3, most=1e3)
+    start: float = option(0.0, 'skip so much of the beginning of the bag [s]', least=0.0, most=1e9)
+    duration: float | None = option(None, 'play so much of the bag [s]; default: all',
+                                    least=1e-3, most=1e9)
+    loop: bool = option(False, 'begin again at the end, until interrupted')
+    clock: float | None = option(None, 'publish the time of the bag on /clock, so often [Hz]; '
+                                 '40 without a value', least=1e-3, most=1e3, bare=40.0)
+    wait_for_subscribers: int | None = option(
+        None, 'begin when the image topic has so many subscribers (without images: every topic); '
+        '1 without a value', least=1, bare=1)
+
+
 def add_arguments(parser: argparse.ArgumentParser, options: type[Any]) -> None:
     """Add one ``--name`` for each field of an options dataclass."""
     group = parser.add_argument_group((options.__doc__ or '').splitlines()[0].rstrip('.'))
     for declared in fields(options):
         meta = declared.metadata
-        default = '' if declared.default in (None, MISSING) else ' (default: %(default)s)'
-        group.add_argument(
-            f'--{declared.name.replace("_", "-")}', default=declared.default,
-            choices=meta['choices'] or None, type=_parser_of(options, declared.name, meta),
-            metavar=None if meta['choices'] else declared.name.upper(),
-            help=meta['description'] + default)
+        about: dict[str, Any] = {'help': meta['description'], 'default': declared.default}
+        if isinstance(declared.default, bool):
+            about |= {'action': 'store_true'}
+        else:
+            about |= {'choices': meta['choices'] or None,
+                      'metavar': None if meta['choices'] else declared.name.upper(),
+                      'type': _parser_of(options, declared.name, meta)}
+            if declared.default not in (None, MISSING, ()):
+                about['help'] += ' (default: %(default)s)'
+        if isinstance(declared.default, tuple):
+            about |= {'action': 'append', 'default': None}
+        if meta['bare'] is not None:
+            about |= {'nargs': '?', 'const': meta['bare']}
+        group.add_argument(f'--{declared.name.replace("_", "-")}', **about)
 
 
 def from_arguments(options: type[Options], arguments: argparse.Namespace) -> Options:
     """Build the dataclass from parsed arguments."""
     values = {declared.name: getattr(arguments, declared.name)
               for declared in fields(options)}  # type: ignore[arg-type]
-    return options(**values)
+    return options(**{name: tuple(value) if isinstance(value, list) else value
+                      for name, value in values.items() if value is not None})
 
 
 def _parser_of(options: type[Any], name: str, meta: Any) -> Any:
@@ -84,7 +112,14 @@ def _parser_of(options: type[Any], name: str, meta: Any) -> Any:
     kind = next(part for part in typing.get_args(hint) or (hint,) if part is not types.NoneType)
 
     def parse(text: str) -> Any:
-        value = kind(text)
+        try:
+            value = kind(text)
+        except ValueError as error:
+            if meta['bare'] is None:
+                raise
+            raise argparse.ArgumentTypeError(
+                f'invalid {kind.__name__} value: {text!r}; without a value it must not stand '
+                'before another argument') from error
         if kind is not str and not (meta['least'] is None or value >= meta['least']):
             raise argparse.ArgumentTypeError(f'expected at least {meta["least"]}, came {text}')
         if kind is not str and not (meta['most'] is None or value <= meta['most']):

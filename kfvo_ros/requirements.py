@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Which pip package brings which module, for the line that names a missing one."""
+"""Where each module comes from, for the line that names a missing one."""
 
 from __future__ import annotations
 
@@ -11,14 +11,20 @@ PIP_NAMES = {'cv2': 'opencv-python-headless', 'mcap': 'mcap', 'numba': 'numba',
              'threadpoolctl': 'threadpoolctl', 'tqdm': 'tqdm', 'yaml': 'PyYAML'}
 """The modules of setup.py's install_requires, by the name they are imported under."""
 
+ROS_MODULES = frozenset(('rclpy', 'rosgraph_msgs'))
+"""What a ROS 2 installation brings; setup.py has it as wheels, under the extra ``ros``."""
 
-def missing_dependency(error: ModuleNotFoundError) -> KfvoError:
+
+def missing_dependency(error: ImportError) -> KfvoError:
     """Return the one line to show for an import that failed.
 
     Raises the error itself when no package of setup.py would bring the module: that is a
     mistake of ours, not of the installation.
     """
     module = (error.name or '').partition('.')[0]
+    if module in ROS_MODULES:
+        return KfvoError(f"{module} is missing: source /opt/ros/jazzy/setup.bash, or pip install "
+                         "'kfvo_ros[ros]' where there is none")
     if module not in PIP_NAMES:
         raise error
     return KfvoError(f'{module} is missing: pip install {PIP_NAMES[module]}')

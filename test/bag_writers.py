@@ -37,6 +37,7 @@ class BagWriter:
         self.storage = storage
         self.is_ros1 = storage == 'ros1'
         self.silent: dict[str, str] = {}  # topic -> type, announced but never sent
+        self.offers: dict[str, dict[str, Any]] = {}  # topic -> how add_connection is told its QoS
         self.store = get_typestore(Stores.ROS1_NOETIC if self.is_ros1 else Stores.ROS2_JAZZY)
         if self.is_ros1:
             for name in ('tf2_msgs/msg/TFMessage', 'tf/msg/tfMessage'):
@@ -144,7 +145,8 @@ class BagWriter:
             for topic, bag_time_ns, message in records:
                 kind = message.__msgtype__
                 if topic not in connections:
-                    connections[topic] = writer.add_connection(topic, kind, typestore=self.store)
+                    connections[topic] = writer.add_connection(
+                        topic, kind, typestore=self.store, **self.offers.get(topic, {}))
                 serialize = self.store.serialize_ros1 if self.is_ros1 else self.store.serialize_cdr
                 writer.write(connections[topic], bag_time_ns, serialize(message, kind))
         return path

@@ -13,7 +13,13 @@ import pytest
 from kfvo_ros import assembly
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.keyframes import POLICIES
-from kfvo_ros.options import OdometryOptions, SequenceOptions, add_arguments, from_arguments
+from kfvo_ros.options import (
+    OdometryOptions,
+    PlayOptions,
+    SequenceOptions,
+    add_arguments,
+    from_arguments,
+)
 from kfvo_ros.scale import SCALE_RULES
 
 OTHER = {
@@ -75,6 +81,28 @@ def test_wrong_values_are_refused_with_what_came(options, arguments, complaint, 
     assert stopped.value.code == 2
     message = capsys.readouterr().err.splitlines()[-1]
     assert complaint in message
+
+
+def test_play_options():
+    assert parse(PlayOptions) == PlayOptions()
+    assert parse(PlayOptions, '--topic', '/a', '--topic', 'b', '--rate', '0.5', '--start', '1.5',
+                 '--duration', '2', '--loop', '--clock', '25', '--wait-for-subscribers',
+                 '3') == PlayOptions(('/a', 'b'), 0.5, 1.5, 2.0, True, 25.0, 3)
+    bare = parse(PlayOptions, '--clock', '--wait-for-subscribers')
+    assert (bare.clock, bare.wait_for_subscribers) == (40.0, 1)
+
+
+@pytest.mark.parametrize(('arguments', 'complaint'), [
+    (['--clock', 'walk.bag'], "invalid float value: 'walk.bag'; without a value"),
+    (['--wait-for-subscribers', '0'], 'at least 1'),
+    (['--start', '-1'], 'at least 0'),
+    (['--duration', 'nan'], 'nan'),
+    (['--rate', 'fast'], 'fast'),
+])
+def test_wrong_play_options(arguments, complaint, capsys):
+    with pytest.raises(SystemExit):
+        parse(PlayOptions, *arguments)
+    assert complaint in capsys.readouterr().err.splitlines()[-1]
 
 
 def test_range_ends_are_allowed():

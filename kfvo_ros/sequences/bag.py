@@ -122,7 +122,7 @@ def _choose_image_topic(bag: Bag, topic: str | None) -> str:
     """Return the topic asked for, or the first by name that is not of depth images."""
     if topic is not None:
         return bag.find(topic, IMAGE_TYPES, 'images')
-    candidates = sorted(bag.of_type(*IMAGE_TYPES), key=lambda name: ('depth' in name, name))
+    candidates = bag.image_topics()
     if not candidates:
         raise KfvoError(f'{bag.path}: expected a topic of type {IMAGE} or {COMPRESSED_IMAGE}; its '
                         f'topics are: {", ".join(sorted(bag.topics)) or "none"}')

@@ -1,0 +1,134 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""``python -m kfvo_ros.play BAG``: a bag of ROS 2 or ROS 1 onto ROS topics."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from kfvo_ros import __version__
+from kfvo_ros.errors import KfvoError
+
+EXAMPLES = """examples:
+  python -m kfvo_ros.play MH_01_easy.bag --wait-for-subscribers
+  python -m kfvo_ros.play MH_01_easy.bag --start 40 --duration 20 --loop --clock
+  python -m kfvo_ros.play demo/bag --topic /cam0/image_raw --rate 0.5
+  python -m kfvo_ros.play MH_01_easy.bag --ros-args -r /cam0/image_raw:=/image
+"""
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+_log = logging.getLogger('kfvo_ros.play')  # not __main__, as which it is run
+
+
+class Interrupted(KeyboardInterrupt):
+    """SIGINT or SIGTERM came.
+
+    A KeyboardInterrupt itself, once it has passed through an `exec` (as dataclasses use), makes
+    Python end by SIGINT at last, caught or not.
+    """
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; return its exit status."""
+    logging.basicConfig(format='kfvo_play: %(message)s', level=logging.WARNING)
+    logging.getLogger('kfvo_ros').setLevel(logging.INFO)
+    for number in SIGNALS:
+        signal.signal(number, _interrupt)
+    try:
+        _run(sys.argv[1:] if argv is None else argv)
+        return 0
+    except ImportError as error:
+        from kfvo_ros.requirements import missing_dependency
+        problem = missing_dependency(error)
+    except KfvoError as error:
+        problem = error
+    except Interrupted:
+        return 0  # the usual end of a player
+    print(f'kfvo_play: error: {problem}', file=sys.stderr)
+    return 1
+
+
+def _run(argv: list[str]) -> None:
+    # The heavy imports come after the arguments were checked: --help answers at once.
+    with _signals_later():
+        from kfvo_ros.options import PlayOptions, from_arguments
+        arguments = _parse(argv)
+        options = from_arguments(PlayOptions, arguments)
+        from kfvo_ros.ros.player import Player
+        from kfvo_ros.ros.session import publishing_node
+        from kfvo_ros.sequences.bag_reader import Bag
+    with Bag(Path(arguments.bag)) as bag:
+        topics = _choose_topics(bag, options.topic)
+        with publishing_node('kfvo_play', argv) as node:
+            player = Player(node, bag, topics, options)
+            try:
+                player.play()
+                ending = ''
+            except Interrupted:
+                ending = f', interrupted at {player.seconds:.1f} s'
+            finally:
+                # Another Ctrl-C must not end the clean-up in a traceback.
+                for number in SIGNALS:
+                    signal.signal(number, signal.SIG_IGN)
+    print(f'{player.count} messages published{ending}')
+
+
+@contextmanager
+def _signals_later() -> Iterator[None]:
+    """Hold signals back: rclpy tells of one during its import as of a broken installation."""
+    signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
+
+
+def _interrupt(number: int, frame: Any) -> None:
+    raise Interrupted
+
+
+def _parse(argv: list[str]) -> argparse.Namespace:
+    from kfvo_ros.options import PlayOptions, add_arguments
+    parser = argparse.ArgumentParser(
+        prog='kfvo_play', description='Play a bag onto ROS topics.', epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('bag', help='ROS 1 .bag, ROS 2 folder with metadata.yaml, .mcap or .db3')
+    parser.add_argument('--version', action='version', version=f'kfvo_ros {__version__}')
+    add_arguments(parser, PlayOptions)
+    if '--ros-args' in argv:
+        from kfvo_ros.ros.session import without_ros_arguments
+        argv = without_ros_arguments(argv)
+    return parser.parse_args(argv)
+
+
+def _choose_topics(bag: Any, wanted: tuple[str, ...]) -> list[str]:
+    """Return the topics to play: those wanted, or all but the image topics after the first."""
+    if wanted:
+        return [_find_topic(bag, topic) for topic in dict.fromkeys(wanted)]
+    if not bag.topics:
+        raise KfvoError(f'{bag.path} holds no messages')
+    images = bag.image_topics()
+    if images[1:]:
+        _log.info('of the image topics only %s is played; --topic plays others: %s', images[0],
+                  ', '.join(images[1:]))
+    return [topic for topic in bag.topics if topic not in images[1:]]
+
+
+def _find_topic(bag: Any, topic: str) -> str:
+    name = f'/{topic.lstrip("/")}'
+    if name not in bag.topics:
+        raise KfvoError(f'{bag.path} has no messages on {topic}; its topics are: '
+                        f'{", ".join(sorted(bag.topics)) or "none"}')
+    return name
+
+
+if __name__ == '__main__':
+    sys.exit(main())
