@@ -50,7 +50,7 @@ setup(
     entry_points={
         'console_scripts': [
             'kfvo_run = kfvo_ros.run:main',
-            'kfvo_node = kfvo_ros.commands:not_in_this_version',
+            'kfvo_node = kfvo_ros.node:main',
             'kfvo_convert = kfvo_ros.convert:main',
             'kfvo_play = kfvo_ros.play:main',
             'kfvo_train = kfvo_ros.commands:not_in_this_version',

@@ -35,10 +35,10 @@ def make_policy(options: OdometryOptions) -> KeyframePolicy:
     return Survival(options.survival_share)
 
 
-def make_odometry(options: OdometryOptions) -> KeyframeOdometry:
-    """Return the odometry that `options` describe."""
-    return KeyframeOdometry(make_backbone(options), make_policy(options), options.scale,
-                            options.window_size)
+def make_odometry(options: OdometryOptions, backbone: Backbone | None = None) -> KeyframeOdometry:
+    """Return the odometry that `options` describe, with a backbone that is there already."""
+    return KeyframeOdometry(backbone or make_backbone(options), make_policy(options),
+                            options.scale_rule, options.window_size)
 
 
 def make_sequence(text: str, options: SequenceOptions) -> Sequence:

@@ -167,6 +167,16 @@ class Camera:
                        fy=self.fy * factor, cx=(self.cx + 0.5) * factor - 0.5,
                        cy=(self.cy + 0.5) * factor - 0.5)
 
+    def cropped(self, x: int, y: int, width: int, height: int) -> Camera:
+        """Return the camera of a region of the image whose first pixel is (x, y)."""
+        return replace(self, width=width, height=height, cx=self.cx - x, cy=self.cy - y)
+
+    def binned(self, across: int, down: int) -> Camera:
+        """Return the camera whose pixels are blocks of `across` x `down` of this one's."""
+        return replace(self, width=self.width // across, height=self.height // down,
+                       fx=self.fx / across, fy=self.fy / down,
+                       cx=(self.cx + 0.5) / across - 0.5, cy=(self.cy + 0.5) / down - 0.5)
+
 
 def guess_camera(width: int, height: int) -> Camera:
     """Return a plausible camera for an image of unknown origin: 60 degrees across the width."""

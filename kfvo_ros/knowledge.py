@@ -22,9 +22,13 @@ class Posed(Protocol):
 
 @dataclass(frozen=True)
 class Knowledge:
-    """The latest frame's pose, the latest points in the world, and the backbone's memory."""
+    """The latest frame's pose, the latest points in the world, and the backbone's memory.
+
+    ``covariance`` (6, 6) is that of the pose where a frame was last placed.
+    """
 
     T_world_latest: np.ndarray = field(default_factory=lambda: np.eye(4))
+    covariance: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
     points: Points | None = None
     memory: Any = None
     memory_scale: float = 1.0
@@ -60,3 +64,14 @@ def turned(covariance: np.ndarray, T_b_a: np.ndarray, scale: float) -> np.ndarra
     rotation = np.kron(np.eye(2), T_b_a[:3, :3])
     unit = np.repeat([scale, 1.0], 3)
     return rotation @ (covariance * np.outer(unit, unit)) @ rotation.T
+
+
+def carried(covariance: np.ndarray, of_carrier: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    """Return the covariance (6, 6) of a frame whose carrier is uncertain too.
+
+    `covariance` is the frame's against its carrier, `offset` (3,) leads from there to the frame;
+    all in the axes of one world. Where the carrier is turned, the frame is moved.
+    """
+    lever = np.eye(6)
+    lever[:3, 3:] = -geometry.skew(offset)
+    return lever @ of_carrier @ lever.T + covariance

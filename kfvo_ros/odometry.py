@@ -21,7 +21,7 @@ from kfvo_ros.backbones.base import (
 from kfvo_ros.images import to_grey
 from kfvo_ros.keyframes.base import DecisionInput, KeyframePolicy
 from kfvo_ros.keyframes.observation import observe
-from kfvo_ros.knowledge import Knowledge, moved, scaled, turned
+from kfvo_ros.knowledge import Knowledge, carried, moved, scaled, turned
 from kfvo_ros.scale import ScaleAligner
 from kfvo_ros.sequences.base import Frame
 from kfvo_ros.stopwatch import Stopwatch
@@ -30,16 +30,22 @@ from kfvo_ros.tracking import Tracker, Tracks
 WINDOW_SIZE = 8
 MAX_LOST_FRAMES = 5
 """After so many lost frames in a row the window starts anew where the camera was last seen."""
+MAX_PENDING = 1000
+"""A camera at rest adds no keyframes: when more frames wait, the oldest are final as they are."""
 
 
 @dataclass
 class Keyframe:
-    """A frame in the window; its pose T_world_camera is overwritten by every window it is in."""
+    """A frame in the window; its pose T_world_camera is overwritten by every window it is in.
+
+    ``covariance`` (6, 6) is the pose's in the world, translation first.
+    """
 
     encoded: Encoded
     tracks: Tracks
     index: int
     T_world_camera: np.ndarray
+    covariance: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -65,14 +71,16 @@ class Update:
     """What one input frame changed.
 
     ``T_world_camera`` (4, 4) is the estimate at arrival, ``covariance`` (6, 6) its covariance
-    in the world, translation first; ``final`` are the frames whose poses became final, in
-    input order; ``median_depth`` of the window's points [trajectory units], None without
-    points; ``durations`` [s] of the steps encode, estimate, decide.
+    in the world, translation first, and ``window_covariance`` the part that arose in this
+    window; ``final`` are the frames whose poses became final, in input order;
+    ``median_depth`` of the window's points [trajectory units], None without points;
+    ``durations`` [s] of the steps encode, estimate, decide.
     """
 
     stamp_ns: int
     T_world_camera: np.ndarray
     covariance: np.ndarray
+    window_covariance: np.ndarray
     status: Status
     is_keyframe: bool
     final: tuple[Placed, ...]
@@ -102,7 +110,7 @@ class KeyframeOdometry:
         self._known = Knowledge()
         self._previous: Previous | None = None
         self._status = Status.OK
-        self._covariance = np.zeros((6, 6))
+        self._window_covariance = np.zeros((6, 6))
         self._lost_in_a_row = 0
         self._frames_seen = 0
 
@@ -124,7 +132,7 @@ class KeyframeOdometry:
             self._stream = self.backbone.open(frame.camera)
         encoded = self._stream.encode(frame)
         self._newest = Keyframe(encoded, self._track(frame, encoded), self._frames_seen,
-                                self._known.T_world_latest)
+                                self._known.T_world_latest, self._known.covariance)
         self._frames_seen += 1
         if self._lost_in_a_row >= MAX_LOST_FRAMES:
             self._start_anew()
@@ -141,7 +149,7 @@ class KeyframeOdometry:
         """
         if estimate is None:
             # The first frame is the world; that of a later start is where the last one was lost.
-            self._known = Knowledge(self._newest.T_world_camera)
+            self._known = Knowledge(self._newest.T_world_camera, self._newest.covariance)
             self._status = Status.OK if self._newest.index == 0 else Status.LOST
             return True
         scale, memory_scale = 1.0, self._known.memory_scale
@@ -151,10 +159,11 @@ class KeyframeOdometry:
         self._lost_in_a_row = self._lost_in_a_row + 1 if estimate.status is Status.LOST else 0
         T_world_anchor = self._keyframes[0].T_world_camera
         self._status = estimate.status
-        self._covariance = turned(estimate.covariance[-1], T_world_anchor, scale)
-        self._known = Knowledge(self._newest.T_world_camera,
-                                moved(estimate.points, T_world_anchor, scale), estimate.memory,
-                                memory_scale)
+        self._doubt(estimate, scale)
+        self._known = Knowledge(
+            self._newest.T_world_camera,
+            self._known.covariance if estimate.status is Status.LOST else self._newest.covariance,
+            moved(estimate.points, T_world_anchor, scale), estimate.memory, memory_scale)
         if estimate.status is Status.LOST or len(self._keyframes) < self.window_size - 1:
             return estimate.status is not Status.LOST
         return self._decision(estimate)
@@ -173,13 +182,15 @@ class KeyframeOdometry:
                             geometry.relative(last.T_world_camera, newest.T_world_camera), False)
             self._release(newest)
         self._pending.append(placed)
+        self._final += self._pending[:-MAX_PENDING]
+        del self._pending[:-MAX_PENDING]
         final = tuple(self._final)
         self._final.clear()
         points = self._known.points
         depth = None if points is None or not len(points.ids) else float(np.median(
             np.linalg.norm(points.positions - newest.T_world_camera[:3, 3], axis=1)))
-        return Update(newest.encoded.stamp_ns, newest.T_world_camera, self._covariance,
-                      self._status, keep, final, depth, durations)
+        return Update(newest.encoded.stamp_ns, newest.T_world_camera, newest.covariance,
+                      self._window_covariance, self._status, keep, final, depth, durations)
 
     def finish(self) -> tuple[Placed, ...]:
         """Return the frames whose poses were not final yet; they are now."""
@@ -208,6 +219,15 @@ class KeyframeOdometry:
         poses = geometry.orthonormalise(self._keyframes[0].T_world_camera @ T_anchor_frame)
         for keyframe, pose in zip((*self._keyframes[1:], self._newest), poses[1:], strict=True):
             keyframe.T_world_camera = pose
+
+    def _doubt(self, estimate: Estimate, scale: float) -> None:
+        """Give the newest frame, and the anchor to come, their covariances in the world."""
+        anchor, frames = self._keyframes[0], (*self._keyframes, self._newest)
+        for index in (-1,) if estimate.status is Status.LOST else (1, -1):
+            own = turned(estimate.covariance[index], anchor.T_world_camera, scale)
+            offset = frames[index].T_world_camera[:3, 3] - anchor.T_world_camera[:3, 3]
+            frames[index].covariance = carried(own, anchor.covariance, offset)
+        self._window_covariance = own
 
     def _decision(self, estimate: Estimate) -> DecisionInput:
         """Step 5: what the policy sees."""

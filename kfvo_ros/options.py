@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What users may choose, declared once: command lines (and the node's parameters) follow."""
+"""What users may choose, declared once: command lines and the node's parameters follow."""
 
 from __future__ import annotations
 
@@ -17,10 +17,15 @@ Options = TypeVar('Options')
 
 
 def option(default: Any, description: str, choices: tuple[str, ...] = (),
-           least: float | None = None, most: float | None = None, bare: Any = None) -> Any:
-    """Declare one field: its default, what it does, what it may be, and what no value means."""
+           least: float | None = None, most: float | None = None, bare: Any = None,
+           flag: str = '') -> Any:
+    """Declare one field: its default, what it does, what it may be, and what no value means.
+
+    `flag` is its name on command lines, if another than the field's.
+    """
     return field(default=default, metadata={'description': description, 'choices': choices,
-                                            'least': least, 'most': most, 'bare': bare})
+                                            'least': least, 'most': most, 'bare': bare,
+                                            'flag': flag})
 
 
 @dataclass(frozen=True)
@@ -29,8 +34,9 @@ class OdometryOptions:
 
     backbone: str = option('geometric', 'model that places the frames of a window',
                            ('geometric',))
-    scale: str | None = option(None, "scale alignment between windows; default the backbone's own",
-                               SCALE_RULES)
+    scale_rule: str | None = option(
+        None, "scale alignment between windows; default the backbone's own", SCALE_RULES,
+        flag='scale')
     keyframes: str = option('survival', 'policy that decides which frames stay', POLICIES)
     flow_threshold: float = option(
         50.0, 'optical_flow: keep when the tracks moved farther since the last keyframe [px]',
@@ -95,7 +101,8 @@ def add_arguments(parser: argparse.ArgumentParser, options: type[Any]) -> None:
             about |= {'action': 'append', 'default': None}
         if meta['bare'] is not None:
             about |= {'nargs': '?', 'const': meta['bare']}
-        group.add_argument(f'--{declared.name.replace("_", "-")}', **about)
+        group.add_argument(f'--{(meta["flag"] or declared.name).replace("_", "-")}',
+                           dest=declared.name, **about)
 
 
 def from_arguments(options: type[Options], arguments: argparse.Namespace) -> Options:

@@ -6,15 +6,13 @@ from __future__ import annotations
 
 import argparse
 import logging
-import signal
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from kfvo_ros import __version__
 from kfvo_ros.errors import KfvoError
+from kfvo_ros.interruption import Interrupted, ignore_signals, raise_on_signals, signals_held
 
 EXAMPLES = """examples:
   python -m kfvo_ros.play MH_01_easy.bag --wait-for-subscribers
@@ -23,25 +21,14 @@ EXAMPLES = """examples:
   python -m kfvo_ros.play MH_01_easy.bag --ros-args -r /cam0/image_raw:=/image
 """
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
-
 _log = logging.getLogger('kfvo_ros.play')  # not __main__, as which it is run
-
-
-class Interrupted(KeyboardInterrupt):
-    """SIGINT or SIGTERM came.
-
-    A KeyboardInterrupt itself, once it has passed through an `exec` (as dataclasses use), makes
-    Python end by SIGINT at last, caught or not.
-    """
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command; return its exit status."""
     logging.basicConfig(format='kfvo_play: %(message)s', level=logging.WARNING)
     logging.getLogger('kfvo_ros').setLevel(logging.INFO)
-    for number in SIGNALS:
-        signal.signal(number, _interrupt)
+    raise_on_signals()
     try:
         _run(sys.argv[1:] if argv is None else argv)
         return 0
@@ -58,16 +45,16 @@ def main(argv: list[str] | None = None) -> int:
 
 def _run(argv: list[str]) -> None:
     # The heavy imports come after the arguments were checked: --help answers at once.
-    with _signals_later():
+    with signals_held():
         from kfvo_ros.options import PlayOptions, from_arguments
         arguments = _parse(argv)
         options = from_arguments(PlayOptions, arguments)
-        from kfvo_ros.ros.player import Player
-        from kfvo_ros.ros.session import publishing_node
+        from kfvo_ros.ros.player import Player, make_node
+        from kfvo_ros.ros.session import spinning
         from kfvo_ros.sequences.bag_reader import Bag
     with Bag(Path(arguments.bag)) as bag:
         topics = _choose_topics(bag, options.topic)
-        with publishing_node('kfvo_play', argv) as node:
+        with spinning(make_node, argv) as node:
             player = Player(node, bag, topics, options)
             try:
                 player.play()
@@ -75,24 +62,8 @@ def _run(argv: list[str]) -> None:
             except Interrupted:
                 ending = f', interrupted at {player.seconds:.1f} s'
             finally:
-                # Another Ctrl-C must not end the clean-up in a traceback.
-                for number in SIGNALS:
-                    signal.signal(number, signal.SIG_IGN)
+                ignore_signals()
     print(f'{player.count} messages published{ending}')
-
-
-@contextmanager
-def _signals_later() -> Iterator[None]:
-    """Hold signals back: rclpy tells of one during its import as of a broken installation."""
-    signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
-
-
-def _interrupt(number: int, frame: Any) -> None:
-    raise Interrupted
 
 
 def _parse(argv: list[str]) -> argparse.Namespace:

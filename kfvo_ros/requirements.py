@@ -11,7 +11,9 @@ PIP_NAMES = {'cv2': 'opencv-python-headless', 'mcap': 'mcap', 'numba': 'numba',
              'threadpoolctl': 'threadpoolctl', 'tqdm': 'tqdm', 'yaml': 'PyYAML'}
 """The modules of setup.py's install_requires, by the name they are imported under."""
 
-ROS_MODULES = frozenset(('rclpy', 'rosgraph_msgs'))
+ROS_MODULES = frozenset(('rclpy', 'rcl_interfaces', 'rosgraph_msgs', 'sensor_msgs', 'nav_msgs',
+                         'geometry_msgs', 'diagnostic_msgs', 'std_msgs', 'std_srvs',
+                         'builtin_interfaces'))
 """What a ROS 2 installation brings; setup.py has it as wheels, under the extra ``ros``."""
 
 

@@ -5,9 +5,6 @@
 from __future__ import annotations
 
 import json
-import re
-import resource
-import sys
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -17,6 +14,7 @@ import numpy as np
 from kfvo_ros import metrics
 from kfvo_ros.backbones.base import Status
 from kfvo_ros.errors import KfvoError
+from kfvo_ros.memory_use import peak_rss_mb
 from kfvo_ros.odometry import Placed, Update
 from kfvo_ros.sequences.base import GroundTruth
 from kfvo_ros.trajectory import Trajectory, format_tum_line
@@ -114,15 +112,3 @@ def evaluate(estimate: Trajectory, truth: GroundTruth | None) -> dict[str, Any]:
     return {'ate_rmse_m': error.rmse, 'ate_alignment': 'sim3', 'ate_scale': error.alignment.scale,
             'path_length_m': error.path_length, 'matched_frames': len(error.errors),
             'ground_truth_frame': truth.frame}
-
-
-def peak_rss_mb() -> float:
-    """Return the largest resident memory of this process so far [MiB]."""
-    status = Path('/proc/self/status')
-    if status.exists():
-        # getrusage would count what the parent held before it started this program.
-        peak = re.search(r'VmHWM:\s*(\d+) kB', status.read_text(encoding='ascii'))
-        if peak:
-            return int(peak[1]) / 1024.0
-    unit = 1024.0 ** 2 if sys.platform == 'darwin' else 1024.0
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit

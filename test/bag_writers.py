@@ -68,16 +68,17 @@ class BagWriter:
                          format=format, data=cv2.imencode('.png', bgr)[1].reshape(-1))
 
     def camera_info(self, fx: float, *, projection_fx: float = 0.0, width: int = WIDTH,
-                    distortion: Iterable[float] = (), binning: int = 0,
-                    roi: tuple[int, int] = (0, 0)) -> Any:
+                    height: int = HEIGHT, distortion: Iterable[float] = (), binning: int = 0,
+                    roi: tuple[int, int, int, int] = (0, 0, 0, 0)) -> Any:
         K = np.array([fx, 0, 16, 0, fx, 12, 0, 0, 1], dtype=np.float64)
         P = np.array([projection_fx, 0, 15, 0, 0, projection_fx, 11, 0, 0, 0, 1, 0], dtype=float)
         matrices = {'k': K, 'p': P, 'r': np.eye(3).ravel(), 'd': np.array([*distortion], float)}
         if self.is_ros1:
             matrices = {name.upper(): value for name, value in matrices.items()}
-        region = self.make('sensor_msgs/RegionOfInterest', x_offset=roi[0], y_offset=0,
-                           width=roi[1], height=HEIGHT if roi[1] else 0, do_rectify=False)
-        return self.make('sensor_msgs/CameraInfo', header=self.header(0), height=HEIGHT,
+        x, y, across, down = roi
+        region = self.make('sensor_msgs/RegionOfInterest', x_offset=x, y_offset=y,
+                           width=across, height=down, do_rectify=False)
+        return self.make('sensor_msgs/CameraInfo', header=self.header(0), height=height,
                          width=width, distortion_model='plumb_bob', binning_x=binning,
                          binning_y=binning, roi=region, **matrices)
 

@@ -210,13 +210,18 @@ def test_an_uncalibrated_camera_info_is_none(tmp_path):
     assert open_bag(writer, tmp_path, info, images(writer), camera=None).camera.guessed
 
 
-@pytest.mark.parametrize('fields', [{'binning': 2}, {'roi': (0, 16)}, {'roi': (1, WIDTH)}])
-def test_binning_and_region_of_interest_are_refused(fields, tmp_path):
+@pytest.mark.parametrize(('fields', 'expected'), [
+    ({'width': 2 * WIDTH, 'height': 2 * HEIGHT, 'binning': 2}, (16.5, 16.5, 7.75, 5.75)),
+    ({'width': 40, 'height': 40, 'roi': (5, 3, WIDTH, HEIGHT)}, (33.0, 33.0, 11.0, 9.0)),
+    ({'width': 99, 'height': 99, 'roi': (4, 2, 2 * WIDTH, 2 * HEIGHT), 'binning': 2},
+     (16.5, 16.5, 5.75, 4.75)),
+    ({'binning': 2}, (33.0, 33.0, 16.0, 12.0)),  # set, but not applied to this image
+    ({'roi': (0, 0, 16, 12)}, (33.0, 33.0, 16.0, 12.0))])
+def test_binning_and_region_of_interest(fields, expected, tmp_path):
     writer = BagWriter('mcap')
     info = [('/cam0/camera_info', START_NS, writer.camera_info(33.0, **fields))]
-    with pytest.raises(KfvoError, match='/cam0/camera_info: .*binning or a region of interest'):
-        open_bag(writer, tmp_path, info, images(writer), camera=None)
-    assert open_sequence(str(tmp_path / 'walk'), camera=EASY).camera == EASY
+    camera = open_bag(writer, tmp_path, info, images(writer), camera=None).camera
+    assert camera == Camera(WIDTH, HEIGHT, *expected)
 
 
 def test_a_camera_info_of_another_size(tmp_path):

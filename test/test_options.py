@@ -23,7 +23,7 @@ from kfvo_ros.options import (
 from kfvo_ros.scale import SCALE_RULES
 
 OTHER = {
-    OdometryOptions: OdometryOptions(scale='translation', keyframes='optical_flow',
+    OdometryOptions: OdometryOptions(scale_rule='translation', keyframes='optical_flow',
                                      flow_threshold=12.5, survival_share=0.25, window_size=5,
                                      seed=17),
     SequenceOptions: SequenceOptions(kind='tum', camera='a b.yaml', image_topic='/cam0/image',
@@ -38,6 +38,10 @@ def parse(options, *arguments):
     return from_arguments(options, parser.parse_args(list(arguments)))
 
 
+def flag_of(field):
+    return f'--{(field.metadata["flag"] or field.name).replace("_", "-")}'
+
+
 @pytest.mark.parametrize('options', [OdometryOptions, SequenceOptions])
 def test_no_arguments_are_the_defaults(options):
     assert parse(options) == options()
@@ -49,8 +53,8 @@ def test_every_field_goes_through_the_command_line(options):
     different = [name for name, value in asdict(wanted).items()
                  if value != getattr(options(), name)]
     assert set(different) >= {field.name for field in fields(options)} - {'backbone'}
-    arguments = [text for name, value in asdict(wanted).items()
-                 for text in (f'--{name.replace("_", "-")}', str(value))]
+    arguments = [text for field in fields(options)
+                 for text in (flag_of(field), str(getattr(wanted, field.name)))]
     parsed = parse(options, *arguments)
     assert parsed == wanted
     assert [type(value) for value in asdict(parsed).values()] == [
@@ -117,7 +121,7 @@ def test_help_describes_each_option():
         add_arguments(parser, options)
     text = ' '.join(parser.format_help().split())
     for declared in (*fields(OdometryOptions), *fields(SequenceOptions)):
-        assert f'--{declared.name.replace("_", "-")}' in text
+        assert flag_of(declared) in text
         assert ' '.join(declared.metadata['description'].split()) in text
     assert '(default: 0.8)' in text
     assert all(name in text for name in (*POLICIES, *SCALE_RULES))

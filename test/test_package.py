@@ -27,15 +27,15 @@ ROOT = Path(__file__).resolve().parent.parent
 SOURCES = sorted((ROOT / 'kfvo_ros').rglob('*.py'))
 COMMANDS = {'kfvo_node', 'kfvo_run', 'kfvo_convert', 'kfvo_play', 'kfvo_train', 'kfvo_benchmark'}
 BUILT_COMMANDS = {'kfvo_run': 'synthetic:SEED', 'kfvo_convert': '--compressed',
-                  'kfvo_play': '--wait-for-subscribers'}
+                  'kfvo_play': '--wait-for-subscribers', 'kfvo_node': 'camera_info_file'}
 HEADER = ['# Copyright 2026 The kfvo_ros authors', '# SPDX-License-Identifier: Apache-2.0']
 BUILT = ('.git', '.venv*', '*.egg-info', '__pycache__', '.*_cache', 'build', 'install', 'log',
          'demo')
 
 # Rooms by floor, the ground first; modules that are not named stand on the ground.
 FLOORS = ((), ('sequences',), ('backbones',), ('keyframes',), ('knowledge', 'odometry', 'scale'),
-          ('assembly', 'options', 'recording', 'results'), ('ros',),
-          ('commands', 'convert', 'play', 'run'))
+          ('assembly', 'body', 'live', 'options', 'recording', 'results'), ('ros',),
+          ('commands', 'convert', 'node', 'play', 'run'))
 HEAVY = ('rclpy', 'torch', 'scipy', 'stable_baselines3')
 MAY_BE_HEAVY = ('kfvo_ros.ros', 'kfvo_ros.learning', 'kfvo_ros.backbones.vggt')
 

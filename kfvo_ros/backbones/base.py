@@ -122,6 +122,7 @@ class Backbone(ABC):
     """A model that places the frames of a window."""
 
     name: str
+    needs_camera: bool = True
     descriptor_size: int
     signal_names: tuple[str, ...] = ()
     default_scale_rule: str = 'translation'

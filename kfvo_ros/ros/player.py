@@ -52,6 +52,11 @@ BAR = '{desc}: {percentage:3.0f}%|{bar}| {n:.1f}/{total:.1f} s of the bag'
 _log = logging.getLogger(__name__)
 
 
+def make_node() -> Node:
+    """Return the node of a player, which has no parameters to speak of."""
+    return Node('kfvo_play', start_parameter_services=False)
+
+
 class Player:
     """Publishes topics of an open bag by their recorded times; nothing is left out when late.
 

@@ -5,16 +5,22 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+import traceback
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import TypeVar
 
 import rclpy
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.exceptions import InvalidHandle
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.impl.rcutils_logger import RcutilsLogger
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
 from kfvo_ros.errors import KfvoError
+
+AnyNode = TypeVar('AnyNode', bound=Node)
 
 
 def without_ros_arguments(arguments: list[str]) -> list[str]:
@@ -24,26 +30,41 @@ def without_ros_arguments(arguments: list[str]) -> list[str]:
 
 
 @contextmanager
-def publishing_node(name: str, arguments: list[str]) -> Iterator[Node]:
-    """Give a node, named and remapped by the ROS arguments among `arguments`.
+def spinning(make: Callable[[], AnyNode], arguments: list[str]) -> Iterator[AnyNode]:
+    """Give a node, named and remapped by the ROS arguments among `arguments`, served by a thread.
 
-    Its events, such as a subscriber whose QoS does not fit, are told by a thread. Signals are
-    left to Python, so that the node lives until the ``with`` ends.
+    Signals are left to Python, so that the node lives, and may publish, until the ``with`` ends.
     """
     with _told():
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
-        node = rclpy.create_node(name, start_parameter_services=False)
-    executor = SingleThreadedExecutor()
-    executor.add_node(node)
-    thread = threading.Thread(target=executor.spin, name='spin', daemon=True)
-    thread.start()
     try:
-        yield node
+        with _told():
+            node = make()
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        thread = threading.Thread(target=_spin, args=[executor, node.get_logger()],
+                                  name='spin', daemon=True)
+        thread.start()
+        try:
+            yield node
+        finally:
+            executor.shutdown()
+            thread.join()
+            node.destroy_node()
     finally:
-        executor.shutdown()
-        thread.join()
-        node.destroy_node()
         rclpy.try_shutdown()
+
+
+def _spin(executor: SingleThreadedExecutor, logger: RcutilsLogger) -> None:
+    """Serve callbacks; the error of one does not end the others."""
+    while True:
+        try:
+            executor.spin()
+            return
+        except (ExternalShutdownException, InvalidHandle):
+            return
+        except Exception:
+            logger.error(f'unexpected error in a callback:\n{traceback.format_exc()}')
 
 
 @contextmanager

@@ -44,24 +44,21 @@ def is_rectified(image_topic: str) -> bool:
 def camera_from_info(info: Any, rectified: bool, width: int, height: int) -> Camera | None:
     """Return the camera of a sensor_msgs/CameraInfo, None where it says uncalibrated.
 
-    `width` and `height` stand in for a size it leaves zero. Raises KfvoError for binning or a
-    region of interest, which the numbers of the full sensor do not describe.
+    Its numbers are those of the whole sensor; `width` and `height` of the image tell whether its
+    region of interest and binning were applied to it. They stand in for a size it leaves zero.
     """
-    width, height = int(info.width) or width, int(info.height) or height
-    roi = info.roi
-    whole = (roi.x_offset, roi.y_offset) == (0, 0) and \
-        (roi.width, roi.height) in ((0, 0), (width, height))
-    if not whole or max(info.binning_x, info.binning_y) > 1:
-        raise KfvoError('expected images of the whole sensor, came binning or a region of '
-                        'interest, which are not supported; record without')
     matrix, columns = (info.p, 4) if rectified else (info.k, 3)
     fx, cx, fy, cy = (float(matrix[index]) for index in (0, 2, columns + 1, columns + 2))
     if fx == 0.0:
         return None
-    if rectified:
-        return Camera(width, height, fx, fy, cx, cy)
-    return Camera(width, height, fx, fy, cx, cy, info.distortion_model,
-                  tuple(float(value) for value in info.d))
+    lens = ('none', ()) if rectified else (info.distortion_model, tuple(map(float, info.d)))
+    camera = Camera(int(info.width) or width, int(info.height) or height, fx, fy, cx, cy, *lens)
+    if (width, height) == (camera.width, camera.height):
+        return camera
+    roi = info.roi
+    if roi.width and roi.height:
+        camera = camera.cropped(roi.x_offset, roi.y_offset, roi.width, roi.height)
+    return camera.binned(max(info.binning_x, 1), max(info.binning_y, 1))
 
 
 def _raw(image_topic: str) -> str:

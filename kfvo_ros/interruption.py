@@ -1,0 +1,46 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""SIGINT and SIGTERM as one exception, for commands whose usual end they are."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class Interrupted(KeyboardInterrupt):
+    """SIGINT or SIGTERM came.
+
+    A KeyboardInterrupt itself, once it has passed through an `exec` (as dataclasses use), makes
+    Python end by SIGINT at last, caught or not.
+    """
+
+
+def raise_on_signals() -> None:
+    """Let either signal raise Interrupted in the main thread."""
+    for number in SIGNALS:
+        signal.signal(number, _interrupt)
+
+
+def ignore_signals() -> None:
+    """Let nothing disturb the clean-up: another Ctrl-C would end it in a traceback."""
+    for number in SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
+
+
+@contextmanager
+def signals_held() -> Iterator[None]:
+    """Hold signals back: rclpy tells of one during its import as of a broken installation."""
+    signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
+
+
+def _interrupt(number: int, frame: Any) -> None:
+    raise Interrupted

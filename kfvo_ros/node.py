@@ -1,0 +1,67 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""``kfvo_node``, also ``python -m kfvo_ros.node``: live visual odometry in ROS 2."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+
+from kfvo_ros import __version__
+from kfvo_ros.errors import KfvoError
+from kfvo_ros.interruption import Interrupted, ignore_signals, raise_on_signals, signals_held
+
+EXAMPLES = """examples:
+  kfvo_node --ros-args -r image:=/camera/image_raw
+  kfvo_node --ros-args --params-file config/euroc.yaml -p keyframes:=every
+"""
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the node until a signal ends it; return the exit status."""
+    raise_on_signals()
+    try:
+        _run(sys.argv[1:] if argv is None else argv)
+        return 0
+    except ImportError as error:
+        from kfvo_ros.requirements import missing_dependency
+        problem = missing_dependency(error)
+    except KfvoError as error:
+        problem = error
+    except Interrupted:
+        return 0  # the usual end of a node
+    print(f'kfvo_node: error: {problem}', file=sys.stderr)
+    return 1
+
+
+def _run(argv: list[str]) -> None:
+    with signals_held():
+        from kfvo_ros.ros.node import KfvoNode
+        from kfvo_ros.ros.session import spinning, without_ros_arguments
+        from kfvo_ros.threads import single_threaded
+    _parse(without_ros_arguments(argv))
+    with single_threaded(), spinning(KfvoNode, argv) as node:
+        try:
+            while node.context.ok():
+                time.sleep(0.5)
+        except Interrupted:
+            pass
+        finally:
+            ignore_signals()
+            node.close()
+
+
+def _parse(argv: list[str]) -> None:
+    from kfvo_ros.options import OdometryOptions
+    from kfvo_ros.ros.parameters import NodeOptions, describe
+    parser = argparse.ArgumentParser(
+        prog='kfvo_node', description='Visual odometry of one camera. All choices are ROS '
+        'parameters:\n\n' + describe(NodeOptions, OdometryOptions), epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('--version', action='version', version=f'kfvo_ros {__version__}')
+    parser.parse_args(argv)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

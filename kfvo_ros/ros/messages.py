@@ -1,0 +1,99 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Between ROS messages and arrays, and nowhere else.
+
+By default rclpy does not check what is put into a message: an int in a float field is sent as
+5e-324, a numpy float32 likewise, a two-dimensional covariance as garbage. So everything is cast
+here, field by field.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, TransformStamped, Vector3
+from nav_msgs.msg import Odometry, Path
+from sensor_msgs.msg import CompressedImage, Image
+from std_msgs.msg import Header
+
+from kfvo_ros import geometry
+from kfvo_ros.images import decode_compressed, decode_image
+from kfvo_ros.trajectory import NANOSECONDS
+
+
+def to_array(message: Image | CompressedImage) -> np.ndarray:
+    """Return the pixels, (H, W) or (H, W, 3) RGB uint8; raises KfvoError."""
+    if isinstance(message, CompressedImage):
+        return decode_compressed(message.data, message.format)
+    return decode_image(message.encoding, message.height, message.width, message.step,
+                        bool(message.is_bigendian), message.data)
+
+
+def to_stamp_ns(stamp: Time) -> int:
+    """Return nanoseconds."""
+    return stamp.sec * NANOSECONDS + stamp.nanosec
+
+
+def make_header(stamp_ns: int, frame_id: str) -> Header:
+    """Return a header."""
+    seconds, nanoseconds = divmod(int(stamp_ns), NANOSECONDS)
+    return Header(stamp=Time(sec=seconds, nanosec=nanoseconds), frame_id=frame_id)
+
+
+def make_odometry(stamp_ns: int, frame_id: str, child_frame_id: str, T_frame_child: np.ndarray,
+                  covariance: np.ndarray, twist: np.ndarray, twist_covariance: np.ndarray
+                  ) -> Odometry:
+    """Return the pose in `frame_id` and the `twist` (6,), linear first, in the child frame.
+
+    Both covariances are (6, 6), of position (velocity) first, then of rotation (its velocity).
+    """
+    message = Odometry(header=make_header(stamp_ns, frame_id), child_frame_id=child_frame_id)
+    message.pose.pose = _pose(T_frame_child)
+    message.pose.covariance = np.asarray(covariance, dtype=np.float64).ravel()
+    message.twist.twist.linear = _vector(twist[:3])
+    message.twist.twist.angular = _vector(twist[3:])
+    message.twist.covariance = np.asarray(twist_covariance, dtype=np.float64).ravel()
+    return message
+
+
+def make_path(frame_id: str, poses: Iterable[tuple[int, np.ndarray]]) -> Path:
+    """Return a path of (stamp_ns, T_frame_child), stamped as its last pose."""
+    stamped = [PoseStamped(header=make_header(stamp_ns, frame_id), pose=_pose(pose))
+               for stamp_ns, pose in poses]
+    header = Header(frame_id=frame_id)
+    if stamped:
+        header.stamp = stamped[-1].header.stamp
+    return Path(header=header, poses=stamped)
+
+
+def make_transform(stamp_ns: int, frame_id: str, child_frame_id: str,
+                   T_frame_child: np.ndarray) -> TransformStamped:
+    """Return T_frame_child as TF has it."""
+    message = TransformStamped(header=make_header(stamp_ns, frame_id),
+                               child_frame_id=child_frame_id)
+    message.transform.translation = _vector(T_frame_child[:3, 3])
+    message.transform.rotation = _quaternion(T_frame_child)
+    return message
+
+
+def to_transform(message: TransformStamped) -> np.ndarray:
+    """Return T_frame_child (4, 4)."""
+    t, q = message.transform.translation, message.transform.rotation
+    return geometry.transform_from_xyz_quat(np.array([t.x, t.y, t.z, q.x, q.y, q.z, q.w]))
+
+
+def _pose(pose: np.ndarray) -> Pose:
+    x, y, z = map(float, pose[:3, 3])
+    return Pose(position=Point(x=x, y=y, z=z), orientation=_quaternion(pose))
+
+
+def _vector(values: np.ndarray) -> Vector3:
+    x, y, z = map(float, values)
+    return Vector3(x=x, y=y, z=z)
+
+
+def _quaternion(pose: np.ndarray) -> Quaternion:
+    x, y, z, w = map(float, geometry.quat_xyzw_from_rotation(pose[:3, :3]))
+    return Quaternion(x=x, y=y, z=z, w=w)

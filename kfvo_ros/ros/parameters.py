@@ -1,0 +1,140 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""ROS parameters from dataclasses of options: declared, described, checked in readable lines."""
+
+from __future__ import annotations
+
+import difflib
+import types
+import typing
+from dataclasses import Field, dataclass, fields
+from typing import Any, TypeVar
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.node import Node
+
+from kfvo_ros.errors import KfvoError
+from kfvo_ros.options import option
+
+Options = TypeVar('Options')
+
+ROS_OWN = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')
+"""Beginnings of the names that rclpy declares itself."""
+NAMES = {bool: 'true or false', int: 'a whole number', float: 'a number', str: 'text'}
+MOST = {int: 2 ** 63 - 1, float: 1e308}
+
+
+@dataclass(frozen=True)
+class NodeOptions:
+    """What the node listens to, and what it says."""
+
+    image_topic: str = option(
+        'image', 'images to follow; remapping image does the same. Ends in /compressed for '
+        'sensor_msgs/CompressedImage')
+    image_qos: str = option(
+        'auto', "reliability of the subscription; auto follows the publisher's",
+        ('auto', 'reliable', 'best_effort'))
+    camera_info_topic: str = option('', 'calibration; empty: camera_info beside the images')
+    camera_info_file: str = option(
+        '', 'calibration file (camera_info.yaml), which wins over the topic')
+    queue_size: int = option(
+        1, 'images that may wait while one is worked on; of more, the oldest are dropped',
+        least=1, most=1000)
+    process_every_frame: bool = option(
+        False, 'drop nothing and lag behind instead, for bags (up to 1000 images)')
+    odom_frame: str = option('odom', 'frame in which poses are given: the base at the first image')
+    base_frame: str = option(
+        '', 'frame whose pose is given, such as base_link; empty: the camera, turned to x '
+        'forward, y left, z up, called <camera frame>_body')
+    base_to_camera: str = option(
+        '', 'where the camera is on the base: "x y z qx qy qz qw"; empty: from TF')
+    camera_frame: str = option('', "optical frame of the camera; empty: the images' frame_id")
+    scale: float = option(
+        1.0, "metres per unit of the trajectory, whose unit is the first scene's median depth",
+        least=1e-9, most=1e9)
+    publish_tf: bool = option(True, 'send the pose as TF too')
+    path_max_length: int = option(1000, 'poses in the path; 0: all', least=0)
+    path_rate: float = option(2.0, 'paths per second at most [Hz]', least=0.01, most=100.0)
+    trajectory_file: str = option(
+        '', 'TUM file that grows as poses become final; a number is added to a name that is taken')
+
+
+def read_parameters(node: Node, *kinds: type[Any]) -> list[Any]:
+    """Declare the fields of options dataclasses as parameters of `node` and return the options.
+
+    The node must have been made with ``automatically_declare_parameters_from_overrides``; what
+    it was given and nobody declares is warned of. Raises KfvoError for a value that cannot be.
+    """
+    options = [kind(**{declared.name: _read(node, kind, declared) for declared in fields(kind)})
+               for kind in kinds]
+    known = [declared.name for kind in kinds for declared in fields(kind)]
+    for name in node.get_parameters_by_prefix(''):
+        if name not in known and not name.startswith(ROS_OWN):
+            meant = difflib.get_close_matches(name, known, 1)
+            node.get_logger().warning(
+                f'unknown parameter {name}: '
+                + (f'is {meant[0]} meant?' if meant else f'expected one of {", ".join(known)}'))
+    return options
+
+
+def describe(*kinds: type[Any]) -> str:
+    """Return a text that lists the parameters, their defaults and their meaning."""
+    return '\n'.join(
+        f'  {declared.name}: {declared.metadata["description"]}'
+        + (f' ({", ".join(declared.metadata["choices"])})' if declared.metadata['choices'] else '')
+        + (f' [{declared.default}]' if declared.default not in (None, '') else '')
+        for kind in kinds for declared in fields(kind))
+
+
+def _read(node: Node, kind: type[Any], declared: Field[Any]) -> Any:
+    """Return the value of one parameter, declared with its description and range."""
+    hint = typing.get_type_hints(kind)[declared.name]
+    expected = next(part for part in typing.get_args(hint) or (hint,)
+                    if part is not types.NoneType)
+    # A parameter cannot be None: an empty text stands for it.
+    default = '' if declared.default is None else declared.default
+    value, given = default, node.has_parameter(declared.name)
+    if given:
+        value = _checked(declared, expected, node.get_parameter(declared.name).value)
+        node.undeclare_parameter(declared.name)
+    node.declare_parameter(declared.name, value, _describe(declared, expected),
+                           ignore_override=True)
+    return None if declared.default is None and value == '' else value
+
+
+def _checked(declared: Field[Any], expected: type, value: Any) -> Any:
+    """Return the value in its type; raises KfvoError naming what was expected."""
+    meta, text = declared.metadata, repr(value)
+    if expected is float and type(value) is int:
+        value = float(value)
+    wish = ''
+    if type(value) is not expected:
+        wish = NAMES[expected]
+    elif meta['choices'] and value not in meta['choices'] and not (
+            value == '' and declared.default is None):
+        wish = f'one of {", ".join(meta["choices"])}'
+    elif meta['least'] is not None and not value >= meta['least']:
+        wish = f'at least {meta["least"]}'
+    elif meta['most'] is not None and not value <= meta['most']:
+        wish = f'at most {meta["most"]}'
+    if wish:
+        raise KfvoError(f'parameter {declared.name}: expected {wish}, came {text}')
+    return value
+
+
+def _describe(declared: Field[Any], expected: type) -> ParameterDescriptor:
+    meta = declared.metadata
+    descriptor = ParameterDescriptor(description=meta['description'], read_only=True)
+    if meta['choices']:
+        descriptor.additional_constraints = f'one of {", ".join(meta["choices"])}'
+    least, most = meta['least'], meta['most']
+    if least is not None or most is not None:
+        least = -MOST[expected] if least is None else least
+        most = MOST[expected] if most is None else most
+        if expected is int:
+            descriptor.integer_range = [IntegerRange(from_value=int(least), to_value=int(most),
+                                                     step=1)]
+        else:
+            descriptor.floating_point_range = [
+                FloatingPointRange(from_value=float(least), to_value=float(most), step=0.0)]
+    return descriptor
