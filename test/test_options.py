@@ -136,7 +136,7 @@ def test_options_cannot_be_changed():
 def test_odometry_is_what_the_options_say(keyframes):
     odometry = assembly.make_odometry(OdometryOptions(
         keyframes=keyframes, flow_threshold=12.5, survival_share=0.25, window_size=5,
-        scale='none'))
+        scale_rule='none'))
     assert odometry.policy.name == keyframes
     assert odometry.window_size == 5
     assert odometry.scale.rule == 'none'
