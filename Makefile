@@ -14,17 +14,20 @@ ifneq ($(ROS_DISTRO),)
 CONSTRAINTS ?= constraints-jazzy.txt
 CANDIDATES := python3
 VENV_OPTIONS := --system-site-packages
-EXTRAS ?= test
+ROS :=
 else
 CONSTRAINTS ?= constraints.txt
 CANDIDATES := python3.13 python3.12 python3.11 python3.10 python3
-EXTRAS ?= $(if $(findstring Linux x86_64,$(shell uname -sm)),ros$(comma))test
+ROS := $(if $(findstring Linux x86_64,$(shell uname -sm)),ros$(comma))
 endif
 
 # One environment per constraints file, .venv and .venv-jazzy, and others under a sourced ROS.
 PINS := $(basename $(notdir $(CONSTRAINTS)))
 VENV := .venv$(PINS:constraints%=%)$(if $(ROS_DISTRO),-ros)
 INSTALLED := $(VENV)/.installed
+TOOLS := $(VENV)/.tools
+PIP_INSTALL = $(VENV)/bin/python -m pip install --quiet --disable-pip-version-check \
+	--constraint $(CONSTRAINTS) --editable
 NEWEST := $(if $(findstring jazzy,$(CONSTRAINTS)),12,13)
 
 # The first candidate that runs and has a wheel of every pinned package.
@@ -34,9 +37,10 @@ PYTHON := $(shell for python in $(CANDIDATES); do \
 	$$python -c '$(SUPPORTED)' 2>/dev/null && echo $$python && break; done)
 endif
 
-.PHONY: help test lint clean
+.PHONY: help demo test lint clean
 
 help:
+	@echo 'make demo    a rendered sequence through kfvo_node, over DDS, into demo/'
 	@echo 'make test    install into $(VENV) and run ruff and the tests'
 	@echo 'make lint    ruff and mypy'
 	@echo 'make clean   remove the environments and all that was built'
@@ -45,12 +49,15 @@ help:
 	@echo 'KFVO_DATA=$(KFVO_DATA)  sequences for the tests that want some'
 	@echo 'PYTHON=$(PYTHON)  Python 3.10 to 3.$(NEWEST)'
 
-test: $(INSTALLED)
+demo: $(INSTALLED)
+	$(VENV)/bin/python -m kfvo_ros.demo --output demo
+
+test: $(TOOLS)
 	$(VENV)/bin/ruff check .
 	[ ! -d '$(KFVO_DATA)' ] || export KFVO_DATA="$$(cd '$(KFVO_DATA)' && pwd)"; \
 	PYTEST_DISABLE_PLUGIN_AUTOLOAD=1 $(VENV)/bin/python -m pytest -rs
 
-lint: $(INSTALLED)
+lint: $(TOOLS)
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/mypy
 
@@ -60,8 +67,11 @@ $(INSTALLED): setup.py pyproject.toml $(CONSTRAINTS)
 	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { \
 		echo '$(PYTHON) cannot make virtual environments: apt install python3-venv' >&2; exit 1; }
 	$(PYTHON) -m venv --clear $(VENV_OPTIONS) $(VENV)
-	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check \
-		--constraint $(CONSTRAINTS) --editable '.[$(EXTRAS)]'
+	$(PIP_INSTALL) '.[$(ROS)demo]'
+	@touch $@
+
+$(TOOLS): $(INSTALLED)
+	$(PIP_INSTALL) '.[$(ROS)demo,test]'
 	@touch $@
 
 clean:

@@ -11,6 +11,9 @@ PIP_NAMES = {'cv2': 'opencv-python-headless', 'mcap': 'mcap', 'numba': 'numba',
              'threadpoolctl': 'threadpoolctl', 'tqdm': 'tqdm', 'yaml': 'PyYAML'}
 """The modules of setup.py's install_requires, by the name they are imported under."""
 
+OPTIONAL_PIP_NAMES = {'matplotlib': 'matplotlib'}
+"""Modules that one command needs: an extra of setup.py brings them."""
+
 ROS_MODULES = frozenset(('rclpy', 'rcl_interfaces', 'rosgraph_msgs', 'sensor_msgs', 'nav_msgs',
                          'geometry_msgs', 'diagnostic_msgs', 'std_msgs', 'std_srvs',
                          'builtin_interfaces'))
@@ -27,6 +30,7 @@ def missing_dependency(error: ImportError) -> KfvoError:
     if module in ROS_MODULES:
         return KfvoError(f"{module} is missing: source /opt/ros/jazzy/setup.bash, or pip install "
                          "'kfvo_ros[ros]' where there is none")
-    if module not in PIP_NAMES:
+    packages = PIP_NAMES | OPTIONAL_PIP_NAMES
+    if module not in packages:
         raise error
-    return KfvoError(f'{module} is missing: pip install {PIP_NAMES[module]}')
+    return KfvoError(f'{module} is missing: pip install {packages[module]}')

@@ -34,8 +34,8 @@ BUILT = ('.git', '.venv*', '*.egg-info', '__pycache__', '.*_cache', 'build', 'in
 
 # Rooms by floor, the ground first; modules that are not named stand on the ground.
 FLOORS = ((), ('sequences',), ('backbones',), ('keyframes',), ('knowledge', 'odometry', 'scale'),
-          ('assembly', 'body', 'live', 'options', 'recording', 'results'), ('ros',),
-          ('commands', 'convert', 'node', 'play', 'run'))
+          ('assembly', 'body', 'live', 'options', 'plots', 'recording', 'results'), ('ros',),
+          ('commands', 'convert', 'demo', 'node', 'play', 'run'))
 HEAVY = ('rclpy', 'torch', 'scipy', 'stable_baselines3')
 MAY_BE_HEAVY = ('kfvo_ros.ros', 'kfvo_ros.learning', 'kfvo_ros.backbones.vggt')
 
@@ -215,7 +215,7 @@ def test_command_to_come_says_so(workspace: Path, command: str) -> None:
     outcome = start(workspace, command)
     assert outcome.returncode == 1
     assert outcome.stderr == (f'{command} is not part of kfvo_ros {kfvo_ros.__version__}; '
-                              'kfvo_run is: try kfvo_run --help\n')
+                              'kfvo_run, kfvo_node, kfvo_convert and kfvo_play are\n')
 
 
 # Files

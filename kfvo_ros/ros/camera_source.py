@@ -5,12 +5,12 @@
 from __future__ import annotations
 
 import threading
-from pathlib import Path
 
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo
 
 from kfvo_ros.camera import Camera, read_camera_info
+from kfvo_ros.config_files import find_config
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.ros.following import WAITING, Following
 from kfvo_ros.sequences.bag_camera import camera_from_info, camera_info_topic, is_rectified
@@ -19,8 +19,9 @@ from kfvo_ros.sequences.bag_camera import camera_from_info, camera_info_topic, i
 class CameraSource:
     """The calibration of the images of `image_topic`; nothing is ever guessed.
 
-    A `file` wins over the `info_topic`, which is by default beside the images. Of a rectified
-    topic's CameraInfo, P is taken. Raises KfvoError for a file that is none.
+    A `file`, also one of config/ by its name, wins over the `info_topic`, which is by default
+    beside the images. Of a rectified topic's CameraInfo, P is taken. Raises KfvoError for a
+    file that is none.
     """
 
     def __init__(self, node: Node, image_topic: str, info_topic: str = '',
@@ -28,7 +29,7 @@ class CameraSource:
         self._rectified = is_rectified(image_topic)
         self._info: CameraInfo | None = None
         self._came = threading.Event()
-        self._fixed = read_camera_info(Path(file).expanduser()) if file else None
+        self._fixed = read_camera_info(find_config(file)) if file else None
         self._following = None
         self.name = file
         if self._fixed is None:

@@ -58,10 +58,14 @@ def make_odometry(stamp_ns: int, frame_id: str, child_frame_id: str, T_frame_chi
     return message
 
 
+def make_pose(stamp_ns: int, frame_id: str, T_frame_child: np.ndarray) -> PoseStamped:
+    """Return a pose in `frame_id`."""
+    return PoseStamped(header=make_header(stamp_ns, frame_id), pose=_pose(T_frame_child))
+
+
 def make_path(frame_id: str, poses: Iterable[tuple[int, np.ndarray]]) -> Path:
     """Return a path of (stamp_ns, T_frame_child), stamped as its last pose."""
-    stamped = [PoseStamped(header=make_header(stamp_ns, frame_id), pose=_pose(pose))
-               for stamp_ns, pose in poses]
+    stamped = [make_pose(stamp_ns, frame_id, pose) for stamp_ns, pose in poses]
     header = Header(frame_id=frame_id)
     if stamped:
         header.stamp = stamped[-1].header.stamp

@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the node says: Odometry for every image, Path now and then, TF."""
+"""What the node says: Odometry for every image, keyframes, Path now and then, TF."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable
 
 import numpy as np
+from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry, Path
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -15,7 +16,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from kfvo_ros.body import base_pose, body_motion
 from kfvo_ros.live import LivePose
 from kfvo_ros.ros.base_frame import BaseFrame, TransformSender
-from kfvo_ros.ros.messages import make_odometry, make_path, make_transform
+from kfvo_ros.ros.messages import make_odometry, make_path, make_pose, make_transform
 from kfvo_ros.ros.parameters import NodeOptions
 
 QUIET_S = 5.0
@@ -31,6 +32,7 @@ class Outputs:
         self._base = BaseFrame(node, options)
         self._sender = TransformSender(node, options.publish_tf)
         self._odometry = node.create_publisher(Odometry, '~/odometry', 10)
+        self._keyframe = node.create_publisher(PoseStamped, '~/keyframe', 10)
         # A viewer that starts later gets the last path at once.
         self._path = node.create_publisher(
             Path, '~/path', QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
@@ -41,7 +43,7 @@ class Outputs:
         self._camera_frame = ''
 
     def publish(self, pose: LivePose, camera_frame: str) -> None:
-        """Send one frame's Odometry and transform."""
+        """Send one frame's Odometry and transform, and its pose again if it is a keyframe."""
         self._news = True
         if camera_frame != self._camera_frame or self._T_base_camera is None:
             self._mount(camera_frame)
@@ -53,6 +55,9 @@ class Outputs:
         self._odometry.publish(make_odometry(
             motion.stamp_ns, self._odom_frame, child, motion.T_odom_base, motion.covariance,
             motion.twist, motion.twist_covariance))
+        if pose.is_keyframe:
+            self._keyframe.publish(make_pose(motion.stamp_ns, self._odom_frame,
+                                             motion.T_odom_base))
         self._sender.send(make_transform(motion.stamp_ns, self._odom_frame, child,
                                          motion.T_odom_base))
 
