@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import QoSRequestedIncompatibleQoSInfo, SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import (
@@ -42,7 +43,9 @@ class Following:
         self._auto = reliability == 'auto'
         self._subscription: Subscription | None = None
         if self._auto:
-            self._timer = node.create_timer(POLL_S, self._follow)
+            # Not the node's clock: simulated time stands still until somebody publishes it.
+            self._timer = node.create_timer(POLL_S, self._follow,
+                                            clock=Clock(clock_type=ClockType.STEADY_TIME))
         else:
             self._subscribe(ReliabilityPolicy[reliability.upper()], DurabilityPolicy.VOLATILE)
 

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.clock import Clock
+from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from sensor_msgs.msg import CompressedImage, Image
 from std_srvs.srv import SetBool, Trigger
@@ -53,8 +53,8 @@ class KfvoNode(Node):
         self.create_service(Trigger, '~/reset', self._on_reset)
         self.create_service(SetBool, '~/pause', self._on_pause)
         self.create_service(Trigger, '~/save_trajectory', self._on_save)
-        # Not the node's clock: in simulation it may stand still, and that is worth a word.
-        self.create_timer(1.0, self._diagnose, clock=Clock())
+        # Not the node's clock: simulated time may stand still.
+        self.create_timer(1.0, self._diagnose, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._worker.start()
         self._introduce(odometry, options, cameras)
 
