@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import shutil
 import subprocess
 import sys
@@ -21,14 +20,12 @@ import numpy as np
 
 from kfvo_ros import __version__
 from kfvo_ros.errors import KfvoError
+from kfvo_ros.rehearsal import Heard, rehearse
 from kfvo_ros.sequences import open_sequence
 from kfvo_ros.trajectory import Trajectory, read_tum
 
 SEQUENCE = 'synthetic:8:smooth'
 BAG, TRAJECTORY, SUMMARY, PICTURE = 'bag', 'trajectory.tum', 'summary.json', 'trajectory.png'
-SETTLED_S, PATIENCE_S = 1.5, 60.0
-"""Without a new pose for so long the node has caught up; it is waited for so long at most."""
-STOP_S = 5.0
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -56,9 +53,6 @@ def main(argv: list[str] | None = None) -> int:
 def _demonstrate(text: str, folder: Path) -> dict[str, Any]:
     """Convert, play, listen and evaluate; return the summary."""
     from kfvo_ros import convert
-    # Of its own, so that no other robot in the network hears or disturbs it.
-    os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-    os.environ.setdefault('ROS_DOMAIN_ID', str(1 + os.getpid() % 100))
     sequence = open_sequence(text)
     truth = sequence.ground_truth()
     if truth is None:
@@ -70,53 +64,28 @@ def _demonstrate(text: str, folder: Path) -> dict[str, Any]:
     if convert.main([text, str(folder / BAG)]) != 0:
         raise KfvoError('the sequence could not be converted')
     print('2. kfvo_node and kfvo_play, over DDS', flush=True)
-    heard = _run_node(folder, sequence.topic)
+    heard = rehearse(folder / BAG, sequence.topic, {
+        'queue_size': 10, 'trajectory_file': str(folder / TRAJECTORY)})
     print('3. evaluation', flush=True)
     return _evaluate(folder, text, truth.trajectory, heard)
 
 
-def _run_node(folder: Path, topic: str) -> dict[str, Any]:
-    """Run node and player to the end of the bag; return what was heard of the node."""
-    from kfvo_ros.ros.session import spinning
-    from kfvo_ros.ros.witness import Witness
-    node_command = [sys.executable, '-m', 'kfvo_ros.node', '--ros-args',
-                    '-p', f'image_topic:={topic}', '-p', 'queue_size:=10',
-                    '-p', f'trajectory_file:={folder / TRAJECTORY}']
-    with spinning(Witness, []) as witness, subprocess.Popen(node_command) as node:
-        try:
-            subprocess.run([sys.executable, '-m', 'kfvo_ros.play', str(folder / BAG), '--topic',
-                            topic, '--topic', f'{topic.rpartition("/")[0]}/camera_info',
-                            '--wait-for-subscribers'], check=True)
-            witness.await_silence(SETTLED_S, PATIENCE_S)
-        finally:
-            node.terminate()
-            try:
-                node.wait(STOP_S)
-            except subprocess.TimeoutExpired:
-                node.kill()
-        return {'poses': len(witness.stamps_ns), 'keyframes_ns': witness.keyframes_ns,
-                'diagnostics': witness.values}
-
-
-def _evaluate(folder: Path, text: str, truth: Trajectory, heard: dict[str, Any]
-              ) -> dict[str, Any]:
+def _evaluate(folder: Path, text: str, truth: Trajectory, heard: Heard) -> dict[str, Any]:
     """Write summary and picture."""
     from kfvo_ros.plots import plot_trajectory
     from kfvo_ros.results import evaluate
     from kfvo_ros.sequences.base import GroundTruth
     estimate = read_tum(folder / TRAJECTORY)
-    values = heard['diagnostics']
     summary = {
-        'sequence': text, 'version': __version__, 'frames': int(values['images received']),
-        'poses': heard['poses'], 'dropped': int(values['images dropped']),
-        'keyframes': len(heard['keyframes_ns']),
-        'latency_ms': {'median': float(values['latency median [ms]']),
-                       'p95': float(values['latency 95 % [ms]'])},
+        'sequence': text, 'version': __version__, 'frames': heard.received,
+        'poses': len(heard.stamps_ns), 'dropped': heard.dropped,
+        'keyframes': len(heard.keyframes_ns),
+        'latency_ms': {'median': heard.latency_median_ms, 'p95': heard.latency_p95_ms},
         **evaluate(estimate, GroundTruth(truth))}
     (folder / SUMMARY).write_text(json.dumps(summary, indent=2) + '\n', encoding='utf-8')
     if 'ate_rmse_m' not in summary:
         raise KfvoError(f'no ATE: {summary["ground_truth_problem"]}')
-    plot_trajectory(folder / PICTURE, estimate, truth, np.array(heard['keyframes_ns']),
+    plot_trajectory(folder / PICTURE, estimate, truth, np.array(heard.keyframes_ns),
                     f'kfvo_node on {text}')
     return summary
 

@@ -35,7 +35,8 @@ BUILT = ('.git', '.venv*', '*.egg-info', '__pycache__', '.*_cache', 'build', 'in
 # Rooms by floor, the ground first; modules that are not named stand on the ground.
 FLOORS = ((), ('sequences',), ('backbones',), ('keyframes',), ('knowledge', 'odometry', 'scale'),
           ('assembly', 'body', 'live', 'options', 'plots', 'recording', 'results'), ('ros',),
-          ('commands', 'convert', 'demo', 'node', 'play', 'run'))
+          ('rehearsal',),
+          ('commands', 'convert', 'demo', 'node', 'node_benchmark', 'play', 'run'))
 HEAVY = ('rclpy', 'torch', 'scipy', 'stable_baselines3')
 MAY_BE_HEAVY = ('kfvo_ros.ros', 'kfvo_ros.learning', 'kfvo_ros.backbones.vggt')
 

@@ -16,7 +16,7 @@ from kfvo_ros.memory_use import rss_mb
 
 SILENCE_S = 5.0
 """Without an image for so long, something is wrong."""
-RECENT = 100
+RECENT, RECENT_LATENCIES = 100, 1000
 """Rates and latencies are those of so many frames."""
 
 
@@ -36,7 +36,7 @@ class Monitor:
         self.problem = ''
         self._arrivals: deque[float] = deque(maxlen=RECENT)
         self._departures: deque[float] = deque(maxlen=RECENT)
-        self._latencies: deque[float] = deque(maxlen=RECENT)
+        self._latencies: deque[float] = deque(maxlen=RECENT_LATENCIES)
 
     def image(self) -> float:
         """Count an image and return its time of arrival [s, monotonic]."""

@@ -1,0 +1,64 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""kfvo_node fed by kfvo_play as on a robot: two processes over DDS, and who listens to them."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from kfvo_ros.errors import KfvoError
+
+SETTLED_S, PATIENCE_S = 1.5, 60.0
+"""Without a new pose for so long the node has caught up; it is waited for so long at most."""
+STOP_S = 5.0
+
+
+@dataclass(frozen=True)
+class Heard:
+    """What a node said from its start to its end; latencies from an image's arrival [ms]."""
+
+    stamps_ns: list[int]
+    keyframes_ns: list[int]
+    received: int
+    dropped: int
+    latency_median_ms: float
+    latency_p95_ms: float
+
+
+def rehearse(bag: Path, topic: str, parameters: dict[str, object], rate: float = 1.0) -> Heard:
+    """Play the images of a bag and their CameraInfo to a node with these parameters.
+
+    Raises KfvoError when one of the two ends early.
+    """
+    # Of its own, so that no other robot in the network hears or disturbs it.
+    os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    os.environ.setdefault('ROS_DOMAIN_ID', str(1 + os.getpid() % 100))
+    from kfvo_ros.ros.session import spinning
+    from kfvo_ros.ros.witness import Witness
+    choices = {'image_topic': topic, **parameters}
+    given = [text for name, value in choices.items() for text in ('-p', f'{name}:={value}')]
+    with spinning(Witness, []) as witness, subprocess.Popen(
+            [sys.executable, '-m', 'kfvo_ros.node', '--ros-args', *given]) as node:
+        try:
+            player = subprocess.run(
+                [sys.executable, '-m', 'kfvo_ros.play', str(bag), '--rate', str(rate), '--topic',
+                 topic, '--topic', f'{topic.rpartition("/")[0]}/camera_info',
+                 '--wait-for-subscribers'])
+            witness.await_silence(SETTLED_S, PATIENCE_S)
+        finally:
+            node.terminate()
+            try:
+                node.wait(STOP_S)
+            except subprocess.TimeoutExpired:
+                node.kill()
+    values = witness.values
+    if player.returncode != 0 or node.returncode != 0 or 'images received' not in values:
+        raise KfvoError(f'kfvo_play ended with status {player.returncode} and kfvo_node with '
+                        f'{node.returncode}; expected 0 of both and diagnostics')
+    return Heard(witness.stamps_ns, witness.keyframes_ns, int(values['images received']),
+                 int(values['images dropped']), float(values['latency median [ms]']),
+                 float(values['latency 95 % [ms]']))
