@@ -1,0 +1,57 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The commands that show the whole way: rendered room, bag, node, player, evaluation."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from ros_processes import run_module
+
+from kfvo_ros.trajectory import read_tum
+
+pytest.importorskip('matplotlib', reason="matplotlib is not installed: pip install '.[demo]'")
+
+SEQUENCE = 'synthetic:0:fast'
+
+
+def test_demo_ends_with_trajectory_summary_and_picture(tmp_path: Path) -> None:
+    folder = tmp_path / 'demo'
+    outcome = run_module('kfvo_ros.demo', '--output', folder, '--sequence', SEQUENCE,
+                         timeout=120.0)
+    assert outcome.returncode == 0, outcome.stderr
+    summary = json.loads((folder / 'summary.json').read_text())
+    poses = read_tum(folder / 'trajectory.tum')
+    assert summary['sequence'] == SEQUENCE
+    assert summary['poses'] == len(poses) == summary['frames'] - summary['dropped']
+    assert summary['frames'] == 200
+    assert 0 < summary['keyframes'] <= summary['poses']
+    # How many frames a busy machine drops is not the matter here.
+    assert summary['ate_rmse_m'] < 0.05 * summary['path_length_m']
+    picture = cv2.imread(str(folder / 'trajectory.png'))
+    assert picture.shape[0] >= 480 and picture.std() > 5.0
+    assert 'ATE after Sim(3)' in outcome.stdout
+
+
+def test_demo_wants_ground_truth(tmp_path: Path) -> None:
+    images = tmp_path / 'images'
+    images.mkdir()
+    cv2.imwrite(str(images / '0.png'), np.zeros((24, 32), dtype=np.uint8))
+    outcome = run_module('kfvo_ros.demo', '--output', tmp_path / 'demo', '--sequence', images)
+    assert outcome.returncode == 1
+    assert 'has no ground truth to compare with' in outcome.stderr
+    assert 'Traceback' not in outcome.stderr
+
+
+def test_node_benchmark_accounts_for_every_image() -> None:
+    outcome = run_module('kfvo_ros.node_benchmark', '--seconds', '2', timeout=120.0)
+    assert outcome.returncode == 0, outcome.stderr
+    lines = re.findall(r'^(20 Hz|twice capacity) .*: (\d+) images, .* (-?\d+) unaccounted',
+                       outcome.stdout, re.MULTILINE)
+    assert [name for name, *_ in lines] == ['20 Hz', 'twice capacity']
+    assert all(int(unaccounted) == 0 for *_, unaccounted in lines)
