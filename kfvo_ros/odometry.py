@@ -110,7 +110,7 @@ class KeyframeOdometry:
         self._known = Knowledge()
         self._previous: Previous | None = None
         self._status = Status.OK
-        self._window_covariance = np.zeros((6, 6))
+        self._covariance = self._window_covariance = np.zeros((6, 6))
         self._lost_in_a_row = 0
         self._frames_seen = 0
 
@@ -148,7 +148,8 @@ class KeyframeOdometry:
         There is nothing to decide while the window fills (keep) or for a lost frame (drop).
         """
         if estimate is None:
-            # The first frame is the world; that of a later start is where the last one was lost.
+            # The first frame is the world; that of a later start is where the last one was lost,
+            # and as doubtful.
             self._known = Knowledge(self._newest.T_world_camera, self._newest.covariance)
             self._status = Status.OK if self._newest.index == 0 else Status.LOST
             return True
@@ -189,7 +190,7 @@ class KeyframeOdometry:
         points = self._known.points
         depth = None if points is None or not len(points.ids) else float(np.median(
             np.linalg.norm(points.positions - newest.T_world_camera[:3, 3], axis=1)))
-        return Update(newest.encoded.stamp_ns, newest.T_world_camera, newest.covariance,
+        return Update(newest.encoded.stamp_ns, newest.T_world_camera, self._covariance,
                       self._window_covariance, self._status, keep, final, depth, durations)
 
     def finish(self) -> tuple[Placed, ...]:
@@ -227,7 +228,7 @@ class KeyframeOdometry:
             own = turned(estimate.covariance[index], anchor.T_world_camera, scale)
             offset = frames[index].T_world_camera[:3, 3] - anchor.T_world_camera[:3, 3]
             frames[index].covariance = carried(own, anchor.covariance, offset)
-        self._window_covariance = own
+        self._covariance, self._window_covariance = self._newest.covariance, own
 
     def _decision(self, estimate: Estimate) -> DecisionInput:
         """Step 5: what the policy sees."""
