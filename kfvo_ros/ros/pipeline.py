@@ -6,6 +6,8 @@ from __future__ import annotations
 
 import threading
 import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from rclpy.node import Node
@@ -58,18 +60,12 @@ class Pipeline:
         """Take in an image that arrived at `arrival` [s, monotonic]; never raises."""
         if self.backbone.needs_camera:
             self._cameras.wait(CALIBRATION_WAIT_S)
-        with self._lock:
-            try:
-                self._handle(arrival, message)
-            except KfvoError as error:
-                self._refuse(str(error))
-            except Exception:  # whatever it is, a robot's odometry must not end by it
-                self._refuse(f'unexpected error, starting anew:\n{traceback.format_exc()}')
-                self._end_segment()
+        with self._lock, self._surviving():
+            self._handle(arrival, message)
 
     def idle(self) -> None:
-        """Bring the path up to date when no image comes."""
-        with self._lock:
+        """Bring the path up to date when no image comes; never raises."""
+        with self._lock, self._surviving():
             if self._live is not None:
                 self._outputs.publish_path(self._live.path)
 
@@ -92,6 +88,17 @@ class Pipeline:
         with self._lock:
             self._end_segment()
             self._log.close()
+
+    @contextmanager
+    def _surviving(self) -> Iterator[None]:
+        """Tell of an error instead of raising it: a robot's odometry must not end by one."""
+        try:
+            yield
+        except KfvoError as error:
+            self._refuse(str(error))
+        except Exception:
+            self._refuse(f'unexpected error, starting anew:\n{traceback.format_exc()}')
+            self._end_segment()
 
     def _handle(self, arrival: float, message: Image | CompressedImage) -> None:
         stamp_ns = to_stamp_ns(message.header.stamp)
