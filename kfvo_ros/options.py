@@ -113,10 +113,15 @@ def from_arguments(options: type[Options], arguments: argparse.Namespace) -> Opt
                       for name, value in values.items() if value is not None})
 
 
+def type_of(options: type[Any], name: str) -> type[Any]:
+    """Return the type of a field, that of its elements if it is a tuple, without None."""
+    hint = typing.get_type_hints(options)[name]
+    return next(part for part in typing.get_args(hint) or (hint,) if part is not types.NoneType)
+
+
 def _parser_of(options: type[Any], name: str, meta: Any) -> Any:
     """Return a function from text to the field's type, within its range."""
-    hint = typing.get_type_hints(options)[name]
-    kind = next(part for part in typing.get_args(hint) or (hint,) if part is not types.NoneType)
+    kind = type_of(options, name)
 
     def parse(text: str) -> Any:
         try:

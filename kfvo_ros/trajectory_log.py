@@ -6,7 +6,8 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TextIO
 
@@ -29,6 +30,7 @@ class TrajectoryLog:
     def __init__(self, path: Path | None = None) -> None:
         self.path = path
         self.problem: KfvoError | None = None
+        self._count = 0
         self._file: TextIO
         if path is None:
             self._file = tempfile.TemporaryFile('w+', encoding='ascii')  # noqa: SIM115
@@ -38,22 +40,22 @@ class TrajectoryLog:
     def append(self, poses: Iterable[StampedPose]) -> None:
         """Append poses, and see to it that they are on disk."""
         if self.problem is None:
-            try:
-                self._file.writelines(format_tum_line(*pose) for pose in poses)
+            lines = [format_tum_line(*pose) for pose in poses]
+            with self._told():
+                self._file.writelines(lines)
                 self._file.flush()
-            except OSError as error:
-                self.problem = _unwritable(self.path or Path(tempfile.gettempdir()), error)
+                self._count += len(lines)
 
     def save(self, path: Path, rest: Iterable[StampedPose]) -> int:
         """Copy the log, and poses that are not final yet, to a new file; return their number."""
         copy = _create(path)
+        lines = [format_tum_line(*pose) for pose in rest]
         try:
             with copy:
                 self._file.seek(0)
                 shutil.copyfileobj(self._file, copy)
-                copy.writelines(format_tum_line(*pose) for pose in rest)
-            with path.open(encoding='ascii') as written:
-                return sum(1 for _ in written)
+                copy.writelines(lines)
+            return self._count + len(lines)
         except OSError as error:
             raise _unwritable(path, error) from error
         finally:
@@ -61,10 +63,18 @@ class TrajectoryLog:
 
     def close(self) -> None:
         """Close the file; an empty one is not left behind."""
-        is_empty = self._file.tell() == 0
-        self._file.close()
-        if self.path is not None and is_empty:
+        with self._told():
+            self._file.close()  # where the disk is full, what it still holds fails again
+        if self.path is not None and self._count == 0:
             self.path.unlink(missing_ok=True)
+
+    @contextmanager
+    def _told(self) -> Iterator[None]:
+        """Keep a failure to write as the problem: a full disk must not end an odometry."""
+        try:
+            yield
+        except OSError as error:
+            self.problem = _unwritable(self.path or Path(tempfile.gettempdir()), error)
 
 
 def free_path(path: Path) -> Path:

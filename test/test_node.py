@@ -191,3 +191,19 @@ def test_only_the_newest_image_waits_by_default():
         values = {key: int(rig.state()[2][f'images {key}']) for key in ('received', 'dropped')}
     assert values['dropped'] > 0 and len(came) < COUNT
     assert values['dropped'] + len(came) == values['received']
+
+
+def test_a_folder_that_goes_away_costs_the_file_alone(tmp_path):
+    folder = tmp_path / 'out'
+    with Rig(trajectory_file=folder / 'walk.tum') as rig:
+        rig.drive(make_frames()[:5])
+        folder.rename(tmp_path / 'away')
+        folder.touch()
+        rig.reset()
+        assert len(rig.drive(make_frames()[5:10])) == 5
+        assert str(folder) in rig.wait_for_line('cannot write the trajectory')
+        rig.reset()
+        assert len(rig.drive(make_frames()[10:15])) == 5
+        rig.stop()
+        assert rig.process.returncode == 0
+    assert len(read_tum(tmp_path / 'away' / 'walk.tum')) == 5

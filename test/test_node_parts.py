@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import resource
 import threading
 
 import numpy as np
@@ -120,6 +121,21 @@ def test_log_overwrites_nothing_and_leaves_no_empty_file(tmp_path):
     assert list(tmp_path.iterdir()) == [taken]
     (tmp_path / 'walk-1.tum').touch()
     assert free_path(taken) == tmp_path / 'walk-2.tum'
+
+
+def test_log_survives_a_full_disk(tmp_path):
+    """A limit on the size of files stands in for it: writing fails in the same place."""
+    log = TrajectoryLog(tmp_path / 'walk.tum')
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, limits[1]))
+    try:
+        for stamp in range(1, 4):
+            log.append([(stamp, POSE)])
+        log.close()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert str(log.problem) == (f'cannot write the trajectory {tmp_path / "walk.tum"}: '
+                                'File too large')
 
 
 def test_path_is_the_newest_of_the_poses_in_metres():

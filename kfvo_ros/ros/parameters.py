@@ -5,8 +5,6 @@
 from __future__ import annotations
 
 import difflib
-import types
-import typing
 from dataclasses import Field, dataclass, fields
 from typing import Any, TypeVar
 
@@ -14,7 +12,7 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.node import Node
 
 from kfvo_ros.errors import KfvoError
-from kfvo_ros.options import option
+from kfvo_ros.options import option, type_of
 
 Options = TypeVar('Options')
 
@@ -88,13 +86,11 @@ def describe(*kinds: type[Any]) -> str:
 
 def _read(node: Node, kind: type[Any], declared: Field[Any]) -> Any:
     """Return the value of one parameter, declared with its description and range."""
-    hint = typing.get_type_hints(kind)[declared.name]
-    expected = next(part for part in typing.get_args(hint) or (hint,)
-                    if part is not types.NoneType)
+    expected = type_of(kind, declared.name)
     # A parameter cannot be None: an empty text stands for it.
     default = '' if declared.default is None else declared.default
-    value, given = default, node.has_parameter(declared.name)
-    if given:
+    value = default
+    if node.has_parameter(declared.name):
         value = _checked(declared, expected, node.get_parameter(declared.name).value)
         node.undeclare_parameter(declared.name)
     node.declare_parameter(declared.name, value, _describe(declared, expected),

@@ -146,7 +146,11 @@ class Pipeline:
         if self._live is not None:
             self._live.finish()
             self._live = None
-            self._log = self._new_log()
+            try:
+                self._log = self._new_log()
+            except KfvoError as error:
+                self._logger.error(str(error))
+                self._log = TrajectoryLog()
 
     def _new_log(self) -> TrajectoryLog:
         """Return the log of a segment: each has a file of its own."""
