@@ -15,13 +15,18 @@ from kfvo_ros.errors import KfvoError
 from kfvo_ros.keyframes.base import KeyframePolicy
 from kfvo_ros.keyframes.heuristics import Every, OpticalFlow, Survival
 from kfvo_ros.odometry import KeyframeOdometry
-from kfvo_ros.options import OdometryOptions, SequenceOptions
+from kfvo_ros.options import OdometryOptions, SequenceOptions, VggtOptions
 from kfvo_ros.sequences import open_sequence
 from kfvo_ros.sequences.base import Sequence
 
 
-def make_backbone(options: OdometryOptions) -> Backbone:
-    """Return the backbone that `options` name, ready for its first frame."""
+def make_backbone(options: OdometryOptions, vggt: VggtOptions | None = None) -> Backbone:
+    """Return the backbone that `options` name, ready for its first frame; raises KfvoError."""
+    if options.backbone == 'vggt':
+        from kfvo_ros.backbones.vggt.loading import load_backbone
+        vggt = vggt or VggtOptions()
+        return load_backbone(vggt.weights, vggt.revision, vggt.device, vggt.precision,
+                             vggt.image_width, not vggt.recompute, options.window_size)
     from kfvo_ros.backbones.geometric.backbone import GeometricBackbone
     return GeometricBackbone(options.seed)
 

@@ -35,7 +35,7 @@ class Knowledge:
 
     def seen_from(self, keyframes: Sequence[Posed]) -> Previous | None:
         """Return the hint for a window that starts with `keyframes`; None before any estimate."""
-        if self.memory is None and self.points is None:
+        if len(keyframes) == 1 and self.memory is None and self.points is None:
             return None
         T_anchor_world = geometry.invert(keyframes[0].T_world_camera)
         T_anchor_frame = T_anchor_world @ np.stack([k.T_world_camera for k in keyframes])

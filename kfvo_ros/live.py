@@ -30,6 +30,7 @@ class LivePose:
     ``T_world_camera`` (4, 4) with its ``covariance`` (6, 6) in the axes of the world,
     translation first; ``T_before_camera`` (4, 4) the motion since the frame before, which was
     ``interval_ns`` ago, with ``motion_covariance`` (6, 6) in the same axes; None for the first.
+    ``intrinsics`` K (3, 3) [px] where the backbone estimates them.
     """
 
     stamp_ns: int
@@ -40,6 +41,7 @@ class LivePose:
     T_before_camera: np.ndarray | None
     interval_ns: int
     motion_covariance: np.ndarray
+    intrinsics: np.ndarray | None = None
 
 
 class LiveOdometry:
@@ -72,7 +74,8 @@ class LiveOdometry:
             interval_ns = update.stamp_ns - before.stamp_ns
         return LivePose(update.stamp_ns, self._metric(update.T_world_camera),
                         self._doubt(update.covariance), update.status, update.is_keyframe,
-                        motion, interval_ns, self._doubt(update.window_covariance))
+                        motion, interval_ns, self._doubt(update.window_covariance),
+                        update.intrinsics)
 
     def path(self) -> list[tuple[int, np.ndarray]]:
         """Return (stamp_ns, T_world_camera) of the latest frames as they are refined by now."""

@@ -74,7 +74,8 @@ class Update:
     in the world, translation first, and ``window_covariance`` the part that arose in this
     window; ``final`` are the frames whose poses became final, in input order;
     ``median_depth`` of the window's points [trajectory units], None without points;
-    ``durations`` [s] of the steps encode, estimate, decide.
+    ``durations`` [s] of the steps encode, estimate, decide; ``intrinsics`` K (3, 3) [px] where
+    the backbone estimates them.
     """
 
     stamp_ns: int
@@ -86,6 +87,7 @@ class Update:
     final: tuple[Placed, ...]
     median_depth: float | None
     durations: dict[str, float]
+    intrinsics: np.ndarray | None = None
 
 
 class KeyframeOdometry:
@@ -111,6 +113,7 @@ class KeyframeOdometry:
         self._previous: Previous | None = None
         self._status = Status.OK
         self._covariance = self._window_covariance = np.zeros((6, 6))
+        self._intrinsics: np.ndarray | None = None
         self._lost_in_a_row = 0
         self._frames_seen = 0
 
@@ -159,7 +162,7 @@ class KeyframeOdometry:
             self._chain(scaled(estimate.T_anchor_frame, scale))
         self._lost_in_a_row = self._lost_in_a_row + 1 if estimate.status is Status.LOST else 0
         T_world_anchor = self._keyframes[0].T_world_camera
-        self._status = estimate.status
+        self._status, self._intrinsics = estimate.status, estimate.intrinsics
         self._doubt(estimate, scale)
         self._known = Knowledge(
             self._newest.T_world_camera,
@@ -191,7 +194,8 @@ class KeyframeOdometry:
         depth = None if points is None or not len(points.ids) else float(np.median(
             np.linalg.norm(points.positions - newest.T_world_camera[:3, 3], axis=1)))
         return Update(newest.encoded.stamp_ns, newest.T_world_camera, self._covariance,
-                      self._window_covariance, self._status, keep, final, depth, durations)
+                      self._window_covariance, self._status, keep, final, depth, durations,
+                      self._intrinsics)
 
     def finish(self) -> tuple[Placed, ...]:
         """Return the frames whose poses were not final yet; they are now."""

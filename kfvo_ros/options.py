@@ -32,8 +32,8 @@ def option(default: Any, description: str, choices: tuple[str, ...] = (),
 class OdometryOptions:
     """The method's choices."""
 
-    backbone: str = option('geometric', 'model that places the frames of a window',
-                           ('geometric',))
+    backbone: str = option('geometric', 'model that places the frames of a window: geometric '
+                           'on any processor, vggt on a GPU', ('geometric', 'vggt'))
     scale_rule: str | None = option(
         None, "scale alignment between windows; default the backbone's own", SCALE_RULES,
         flag='scale')
@@ -46,6 +46,27 @@ class OdometryOptions:
         most=1.0)
     window_size: int = option(8, 'frames in a window', least=3, most=32)
     seed: int = option(0, 'seed of every random choice', least=0)
+
+
+@dataclass(frozen=True)
+class VggtOptions:
+    """The VGGT backbone's choices."""
+
+    weights: str = option(
+        'facebook/VGGT-1B', 'vggt: repository on the Hugging Face hub, or a .safetensors or .pt '
+        'file')
+    revision: str | None = option(
+        None, "vggt: the repository's branch, tag or commit; default: main")
+    device: str = option('auto', 'vggt: auto (a GPU if there is one), cpu, cuda or cuda:N')
+    precision: str = option(
+        'auto', 'vggt: numbers of the matrices; auto: what the device does fast',
+        ('auto', 'fp32', 'bf16', 'fp16'))
+    image_width: int = option(
+        518, 'vggt: width of the images that the model sees [px], a multiple of 14; the model '
+        'was trained at 518', least=14, most=4200)
+    recompute: bool = option(
+        False, 'vggt: compute every window in full instead of reusing what is known of its '
+        'frames; the poses are the same')
 
 
 @dataclass(frozen=True)

@@ -46,6 +46,7 @@ class ResultWriter:
         self._placed_poses: list[np.ndarray] = []
         self._durations: dict[str, list[float]] = {}
         self._depths: list[float] = []
+        self._intrinsics: list[np.ndarray] = []
         self._statuses = dict.fromkeys(Status, 0)
         self._keyframe_count = 0
 
@@ -55,6 +56,8 @@ class ResultWriter:
         self._keyframe_count += update.is_keyframe
         if update.median_depth is not None:
             self._depths.append(update.median_depth)
+        if update.intrinsics is not None:
+            self._intrinsics.append(update.intrinsics)
         for step, seconds in update.durations.items():
             self._durations.setdefault(step, []).append(1e3 * seconds)
         self.append(update.final)
@@ -86,10 +89,20 @@ class ResultWriter:
             'extent': metrics.extent(estimate) if len(estimate) else 0.0,
             'median_depth': float(np.median(self._depths)) if self._depths else None,
             'max_rotation_deg': metrics.max_rotation_deg(estimate) if len(estimate) else 0.0,
-            **evaluate(estimate, truth)}
+            **self._camera_seen(), **evaluate(estimate, truth)}
         text = json.dumps(summary, indent=2, allow_nan=False)
         (self.folder / SUMMARY).write_text(text + '\n', encoding='utf-8')
         return summary
+
+    def _camera_seen(self) -> dict[str, dict[str, float | None]]:
+        """Return the median intrinsics [px] of a backbone that estimates them."""
+        if not self._intrinsics:
+            return {}
+        K = np.median(self._intrinsics, axis=0)
+        # A field of view of zero means an infinite focal length, which JSON has no word for.
+        return {'estimated_intrinsics': {
+            name: float(value) if np.isfinite(value) else None
+            for name, value in zip(('fx', 'fy', 'cx', 'cy'), K[[0, 1, 0, 1], [0, 1, 2, 2]])}}
 
     def _milliseconds(self) -> dict[str, dict[str, float]]:
         """Return median and 95th percentile of each step and of their sum."""

@@ -40,7 +40,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def _run(argv: list[str] | None) -> int:
     # The heavy imports come after the arguments were checked: --help answers at once.
-    from kfvo_ros.options import OdometryOptions, SequenceOptions, from_arguments
+    from kfvo_ros.options import OdometryOptions, SequenceOptions, VggtOptions, from_arguments
     arguments = _parse(argv)
     from kfvo_ros import assembly
     from kfvo_ros.results import ResultWriter
@@ -50,14 +50,16 @@ def _run(argv: list[str] | None) -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     with single_threaded():
         sequence = assembly.make_sequence(arguments.sequence, sequence_options)
-        odometry = assembly.make_odometry(odometry_options)
+        odometry = assembly.make_odometry(odometry_options, assembly.make_backbone(
+            odometry_options, from_arguments(VggtOptions, arguments)))
         truth = sequence.ground_truth()
         writer = ResultWriter(Path(arguments.output), arguments.overwrite)
         problem = _process(sequence, odometry, writer, sequence_options.stop)
         writer.append(odometry.finish())
         about = {'sequence': sequence.name, 'backbone': odometry.backbone.name,
                  'keyframe_policy': odometry.policy.name, 'scale_rule': odometry.scale.rule,
-                 'seed': odometry_options.seed, 'version': __version__}
+                 'seed': odometry_options.seed, 'version': __version__,
+                 **odometry.backbone.condition()}
         summary = writer.finish(about | ({'ended_early': problem} if problem else {}), truth)
     print(_describe(summary, writer.folder))
     if problem:
@@ -67,7 +69,7 @@ def _run(argv: list[str] | None) -> int:
 
 
 def _parse(argv: list[str] | None) -> argparse.Namespace:
-    from kfvo_ros.options import OdometryOptions, SequenceOptions, add_arguments
+    from kfvo_ros.options import OdometryOptions, SequenceOptions, VggtOptions, add_arguments
     parser = argparse.ArgumentParser(
         prog='kfvo_run', description='Visual odometry over every frame of a sequence.',
         epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -78,6 +80,7 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument('--overwrite', action='store_true', help='replace earlier results')
     parser.add_argument('--version', action='version', version=f'kfvo_ros {__version__}')
     add_arguments(parser, OdometryOptions)
+    add_arguments(parser, VggtOptions)
     add_arguments(parser, SequenceOptions)
     return parser.parse_args(argv)
 

@@ -21,6 +21,9 @@ from kfvo_ros.camera import Camera
 from kfvo_ros.sequences.base import Frame
 from kfvo_ros.tracking import Tracks
 
+LOST_VARIANCE = 1e2
+"""Variance of each component of a pose that is only a guess."""
+
 
 class Status(str, Enum):
     """What a backbone says of the newest frame of a window."""
@@ -96,7 +99,8 @@ class Estimate:
     ``T_anchor_frame`` (S, 4, 4) float64, the first exactly identity, translations in one
     unit per window; ``covariance`` (S, 6, 6) of each pose in the anchor, translation first,
     then rotation [rad]; ``points`` or None; ``signals`` (len(signal_names),) float32 for the
-    policy; ``status`` of the newest frame; ``memory`` comes back in the next `Previous`.
+    policy; ``status`` of the newest frame; ``memory`` comes back in the next `Previous`;
+    ``intrinsics`` K (3, 3) of the newest image [px] from a model that estimates them.
     """
 
     T_anchor_frame: np.ndarray
@@ -105,6 +109,25 @@ class Estimate:
     signals: np.ndarray
     status: Status = Status.OK
     memory: Any = None
+    intrinsics: np.ndarray | None = None
+
+
+def lost(window: Window, signal_count: int = 0, memory: Any = None) -> Estimate:
+    """Return the known poses, and the last frame's for the new one, which could not be placed.
+
+    `memory` is that of a stream without an estimate so far.
+    """
+    frames = len(window.frames)
+    T_anchor_frame = np.tile(np.eye(4), (frames, 1, 1))
+    points = None
+    if window.previous is not None:
+        T_anchor_frame[:-1] = window.previous.T_anchor_frame
+        T_anchor_frame[-1] = window.previous.T_anchor_latest
+        points, memory = window.previous.points, window.previous.memory
+    covariance = np.tile(LOST_VARIANCE * np.eye(6), (frames, 1, 1))
+    covariance[0] = 0.0
+    return Estimate(T_anchor_frame, covariance, points,
+                    np.zeros(signal_count, dtype=np.float32), Status.LOST, memory)
 
 
 class Stream(ABC):
@@ -134,3 +157,7 @@ class Backbone(ABC):
     @abstractmethod
     def estimate(self, windows: Sequence[Window]) -> list[Estimate]:
         """Place the frames of many windows in one call; no side effects."""
+
+    def condition(self) -> dict[str, str]:
+        """Return what people may want to see of the running model, by name."""
+        return {'device': 'cpu'}

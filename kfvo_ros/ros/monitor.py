@@ -34,6 +34,7 @@ class Monitor:
         self.paused = False
         self.status: Status | None = None
         self.problem = ''
+        self._intrinsics: np.ndarray | None = None
         self._arrivals: deque[float] = deque(maxlen=RECENT)
         self._departures: deque[float] = deque(maxlen=RECENT)
         self._latencies: deque[float] = deque(maxlen=RECENT_LATENCIES)
@@ -45,13 +46,15 @@ class Monitor:
         self._arrivals.append(now)
         return now
 
-    def posed(self, arrival: float, status: Status, is_keyframe: bool) -> None:
-        """Count a frame whose pose has just been published."""
+    def posed(self, arrival: float, status: Status, is_keyframe: bool,
+              intrinsics: np.ndarray | None = None) -> None:
+        """Count a frame whose pose has just been published, with K (3, 3) [px] if it was seen."""
         now = time.monotonic()
         self.processed += 1
         self.keyframes += is_keyframe
         self.lost += status is Status.LOST
         self.status, self.problem = status, ''
+        self._intrinsics = intrinsics
         self._departures.append(now)
         self._latencies.append(now - arrival)
 
@@ -81,6 +84,9 @@ class Monitor:
             'keyframe ratio': f'{self.keyframes / max(self.processed, 1):.3f}',
             'frames lost': self.lost, 'resets': self.resets,
             'memory [MiB]': f'{rss_mb():.0f}', **constants}
+        if self._intrinsics is not None:
+            values['focal lengths as estimated [px]'] = \
+                f'{self._intrinsics[0, 0]:.1f} {self._intrinsics[1, 1]:.1f}'
         status = DiagnosticStatus(
             level=level, name=name, message=summary, hardware_id=hardware_id,
             values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])

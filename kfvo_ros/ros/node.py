@@ -11,8 +11,9 @@ from sensor_msgs.msg import CompressedImage, Image
 from std_srvs.srv import SetBool, Trigger
 
 from kfvo_ros import __version__
+from kfvo_ros.assembly import make_backbone
 from kfvo_ros.errors import KfvoError
-from kfvo_ros.options import OdometryOptions
+from kfvo_ros.options import OdometryOptions, VggtOptions
 from kfvo_ros.ros.camera_source import CameraSource
 from kfvo_ros.ros.following import Following
 from kfvo_ros.ros.messages import make_header
@@ -36,19 +37,21 @@ class KfvoNode(Node):
 
     def __init__(self) -> None:
         super().__init__(NAME, automatically_declare_parameters_from_overrides=True)
-        odometry, options = read_parameters(self, OdometryOptions, NodeOptions)
+        odometry, vggt, options = read_parameters(self, OdometryOptions, VggtOptions,
+                                                  NodeOptions)
         self._monitor = Monitor()
         topic = self.resolve_topic_name(options.image_topic)
         cameras = CameraSource(self, topic, options.camera_info_topic, options.camera_info_file)
-        self._pipeline = Pipeline(self, odometry, options, cameras, Outputs(self, options),
-                                  self._monitor)
+        backbone = make_backbone(odometry, vggt)
+        self._pipeline = Pipeline(self, backbone, odometry, options, cameras,
+                                  Outputs(self, options), self._monitor)
         size = BACKLOG if options.process_every_frame else options.queue_size
         self._worker = Worker(lambda item: self._pipeline.handle(*item), self._pipeline.idle, size)
         self._images = Following(
             self, CompressedImage if topic.endswith(COMPRESSED) else Image, options.image_topic,
             max(size, 10), self._on_image, options.image_qos)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
-        self._constants = {'backbone': odometry.backbone, 'device': 'cpu',
+        self._constants = {'backbone': odometry.backbone,
                            'keyframe policy': self._pipeline.policy_name, 'version': __version__}
         self.create_service(Trigger, '~/reset', self._on_reset)
         self.create_service(SetBool, '~/pause', self._on_pause)
@@ -110,4 +113,5 @@ class KfvoNode(Node):
                 throttle_duration_sec=SILENCE_S)
         header = make_header(self.get_clock().now().nanoseconds, '')
         self._diagnostics.publish(monitor.message(
-            header, f'{self.get_name()}: odometry', topic, self._constants))
+            header, f'{self.get_name()}: odometry', topic,
+            self._constants | self._pipeline.backbone.condition()))

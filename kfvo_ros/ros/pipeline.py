@@ -13,7 +13,8 @@ from pathlib import Path
 from rclpy.node import Node
 from sensor_msgs.msg import CompressedImage, Image
 
-from kfvo_ros.assembly import make_backbone, make_odometry
+from kfvo_ros.assembly import make_odometry
+from kfvo_ros.backbones.base import Backbone
 from kfvo_ros.camera import Camera
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.live import LiveOdometry
@@ -43,16 +44,17 @@ class Pipeline:
     next one begins at the origin. Raises KfvoError for what it cannot be made of.
     """
 
-    def __init__(self, node: Node, odometry: OdometryOptions, options: NodeOptions,
-                 cameras: CameraSource, outputs: Outputs, monitor: Monitor) -> None:
+    def __init__(self, node: Node, backbone: Backbone, odometry: OdometryOptions,
+                 options: NodeOptions, cameras: CameraSource, outputs: Outputs,
+                 monitor: Monitor) -> None:
         self._logger = node.get_logger()
         self._odometry_options, self._options = odometry, options
         self._cameras, self._outputs, self._monitor = cameras, outputs, monitor
-        self.backbone = make_backbone(odometry)
+        self.backbone = backbone
         self.policy_name = make_odometry(odometry, self.backbone).policy.name
         self._lock = threading.Lock()
         self._live: LiveOdometry | None = None
-        self._camera: Camera | None = None
+        self._seen: tuple[int, int, Camera | None] | None = None
         self._last_ns: int | None = None
         self._log = self._new_log()
 
@@ -108,30 +110,33 @@ class Pipeline:
         elif stamp_ns == self._last_ns:
             raise KfvoError(f'two images have the stamp {stamp_ns} ns: the second is ignored')
         image = to_array(message)
-        camera = self._cameras.camera(image.shape[1], image.shape[0])
-        if camera is None and self.backbone.needs_camera:
-            raise KfvoError(f'waiting: {self._cameras.problem()}')
-        live = self._live
-        if live is None or camera != self._camera:
-            live = self._begin(camera)
+        camera = None
+        if self.backbone.needs_camera:
+            camera = self._cameras.camera(image.shape[1], image.shape[0])
+            if camera is None:
+                raise KfvoError(f'waiting: {self._cameras.problem()}')
+        live, seen = self._live, (image.shape[1], image.shape[0], camera)
+        if live is None or seen != self._seen:
+            live = self._begin(*seen)
         self._last_ns = stamp_ns
         pose = live.process(Frame(stamp_ns, image, camera))
         frame = self._options.camera_frame or message.header.frame_id.lstrip('/') or NO_FRAME
         self._outputs.publish(pose, frame)
-        self._monitor.posed(arrival, pose.status, pose.is_keyframe)
+        self._monitor.posed(arrival, pose.status, pose.is_keyframe, pose.intrinsics)
         self._outputs.publish_path(live.path)
         if self._log.problem is not None:
             self._logger.error(str(self._log.problem), once=True)
 
-    def _begin(self, camera: Camera | None) -> LiveOdometry:
+    def _begin(self, width: int, height: int, camera: Camera | None) -> LiveOdometry:
         """Start a segment with this camera."""
         if self._live is not None:
-            self._reset('the calibration changed')
-        self._logger.info('images of an unknown camera' if camera is None else
-                          f'camera {camera.width}x{camera.height}, fx {camera.fx:.1f}, fy '
-                          f'{camera.fy:.1f}, {camera.distortion_model} distortion, from '
-                          f'{self._cameras.name}')
-        self._camera = camera
+            self._reset('the images have another size' if camera is None else
+                        'the calibration changed')
+        self._logger.info(f'images of {width}x{height}, ' + (
+            'of whatever camera' if camera is None else
+            f'fx {camera.fx:.1f}, fy {camera.fy:.1f}, {camera.distortion_model} distortion, from '
+            f'{self._cameras.name}'))
+        self._seen = width, height, camera
         self._live = LiveOdometry(make_odometry(self._odometry_options, self.backbone), self._log,
                                   self._options.scale, self._options.path_max_length or None)
         return self._live

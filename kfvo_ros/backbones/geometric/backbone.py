@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from kfvo_ros.backbones.base import Backbone, Encoded, Estimate, Status, Stream, Window
+from kfvo_ros.backbones.base import Backbone, Encoded, Estimate, Status, Stream, Window, lost
 from kfvo_ros.backbones.geometric import kernels
 from kfvo_ros.backbones.geometric.initialisation import Initialiser
 from kfvo_ros.backbones.geometric.memory import Memory, recall
@@ -28,8 +28,6 @@ MIN_TRACKS = 12
 """The newest frame needs as many tracks in common with the window to be placed."""
 HELD_PARALLAX = 1.0
 """With less parallax to every keyframe of the window a frame tells nothing of translation [px]."""
-LOST_VARIANCE = 1e2
-"""Variance of each component of a pose that is only a guess."""
 
 
 class GeometricStream(Stream):
@@ -92,31 +90,16 @@ def _estimate(window: Window, stream: GeometricStream) -> Estimate:
     history = recall(previous, views[0])
     observations = tabulate(history.views + views, len(history.views))
     if observations.mask[:, -1].sum() < MIN_TRACKS:
-        return _lost(window)
+        return lost(window, len(SIGNAL_NAMES), Memory())
     solution = solve(observations, stream.initialiser, previous, history)
     poses = solution.T_anchor_frame
     if solution.inliers[:, -1].sum() < MIN_TRACKS or not np.isfinite(poses).all():
-        return _lost(window)
+        return lost(window, len(SIGNAL_NAMES), Memory())
     motion = measure_motion(solution, views[-2], views[-1], stream.initialiser.focal)
     return Estimate(poses[solution.anchor:], solution.covariance(), solution.points(),
                     signals(solution, motion),
                     Status.HELD if motion.window_parallax < HELD_PARALLAX else Status.OK,
                     Memory(history.views + views, poses, solution.certain))
-
-
-def _lost(window: Window) -> Estimate:
-    """Return the known poses, and the last frame's for the new one."""
-    frames = len(window.frames)
-    T_anchor_frame = np.tile(np.eye(4), (frames, 1, 1))
-    points, memory = None, Memory()
-    if window.previous is not None:
-        T_anchor_frame[:-1] = window.previous.T_anchor_frame
-        T_anchor_frame[-1] = window.previous.T_anchor_latest
-        points, memory = window.previous.points, window.previous.memory
-    covariance = np.tile(LOST_VARIANCE * np.eye(6), (frames, 1, 1))
-    covariance[0] = 0.0
-    return Estimate(T_anchor_frame, covariance, points,
-                    np.zeros(len(SIGNAL_NAMES), dtype=np.float32), Status.LOST, memory)
 
 
 def _describe(grey: np.ndarray) -> np.ndarray:

@@ -1,0 +1,148 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""VGGT against the contract: encode what is a frame's own, estimate what a window means."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from kfvo_ros import geometry
+from kfvo_ros.backbones.base import Backbone, Encoded, Estimate, Stream, Window, lost
+from kfvo_ros.backbones.vggt import pose_encoding
+from kfvo_ros.backbones.vggt.aggregator import grid_of
+from kfvo_ros.backbones.vggt.config import PATCH, SPECIAL
+from kfvo_ros.backbones.vggt.memory import FrameMemory, features_anew, features_reusing
+from kfvo_ros.backbones.vggt.model import Vggt
+from kfvo_ros.backbones.vggt.out_of_memory import memory_bounded
+from kfvo_ros.backbones.vggt.preprocessing import fit
+from kfvo_ros.camera import Camera
+from kfvo_ros.errors import KfvoError
+from kfvo_ros.sequences.base import Frame
+
+IMAGE_WIDTH = 518
+"""Of the images that the published model was trained on [px]."""
+TRANSLATION_DOUBT, ROTATION_DOUBT = 0.02, 0.005
+"""Standard deviations at least: a share of the distance to the anchor, and radians."""
+LEAST_DOUBT = 1e-3
+"""Nor is a translation known better than this share of the window's extent."""
+
+
+class VggtStream(Stream):
+    """Frames of one sequence, all of one size."""
+
+    def __init__(self, backbone: VggtBackbone) -> None:
+        self._backbone = backbone
+        self._size: tuple[int, ...] | None = None
+
+    def encode(self, frame: Frame) -> Encoded:
+        """See the frame on its own; the descriptor is the trunk's CLS token."""
+        size = frame.image.shape[:2]
+        if self._size not in (None, size):
+            raise KfvoError(f'expected images of {self._size[1]}x{self._size[0]} as before, '
+                            f'{size[1]}x{size[0]} came')
+        self._size = size
+        return self._backbone.see(frame)
+
+    def release(self, encoded: Encoded) -> None:
+        """Free the frame's tensors."""
+        encoded.payload.release()
+
+
+class VggtBackbone(Backbone):
+    """Takes images as they come, of any camera; poses are right up to one scale per window.
+
+    `image_width` [px], a multiple of 14, trades accuracy for time. Without `reuse` every window
+    is computed in full. Raises KfvoError for what cannot be, and when memory runs out.
+    """
+
+    name = 'vggt'
+    needs_camera = False
+
+    def __init__(self, model: Vggt, image_width: int = IMAGE_WIDTH, reuse: bool = True) -> None:
+        if image_width < PATCH or image_width % PATCH:
+            raise KfvoError(f'expected image_width as a multiple of {PATCH}, came {image_width}')
+        self.model = model
+        self.image_width, self.reuse = image_width, reuse
+        self.descriptor_size = model.config.width
+        self.device = model.camera_head.empty_pose_tokens.device
+
+    def open(self, camera: Camera | None) -> VggtStream:
+        """Start a sequence; the camera need not be known."""
+        return VggtStream(self)
+
+    def see(self, frame: Frame) -> Encoded:
+        """Encode one frame."""
+        height, width = frame.image.shape[:2]
+        fitted = fit(height, width, self.image_width)
+        with torch.inference_mode(), memory_bounded(self.device):
+            pixels = torch.tensor(fitted.apply(frame.image), device=self.device)
+            image = pixels.permute(2, 0, 1)[None] / 255.0
+            tokens = self.model.aggregator.see(image)
+            payload = FrameMemory(fitted, grid_of(image), image[0], tokens[:, SPECIAL:])
+            return Encoded(frame.stamp_ns, tokens[0, 0].float().cpu().numpy(), payload)
+
+    def estimate(self, windows: Sequence[Window]) -> list[Estimate]:
+        """Place the frames of many windows; those alike in frames and size go in one batch."""
+        alike: dict[tuple[int, tuple[int, int]], list[int]] = {}
+        for index, window in enumerate(windows):
+            alike.setdefault((len(window.frames), window.frames[0].payload.grid), []).append(index)
+        estimates: dict[int, Estimate] = {}
+        for indices in alike.values():
+            encodings = self.encodings([windows[index] for index in indices])
+            for position, index in enumerate(indices):
+                estimates[index] = _estimate(windows[index], encodings[:, position])
+        return [estimates[index] for index in range(len(windows))]
+
+    def encodings(self, windows: Sequence[Window]) -> np.ndarray:
+        """Return pose encodings (iterations, B, S, 9) of windows of one size."""
+        frames = [[encoded.payload for encoded in window.frames] for window in windows]
+        features = features_reusing if self.reuse else features_anew
+        with torch.inference_mode(), memory_bounded(self.device):
+            return self.model.camera_head(features(self.model.aggregator, frames)).cpu().numpy()
+
+    def condition(self) -> dict[str, str]:
+        """Return device, numbers and what the device's memory holds."""
+        matrices = self.model.aggregator.patch_embed.patch_embed.proj.weight
+        told = {'device': str(self.device), 'precision': str(matrices.dtype).rpartition('.')[2]}
+        if self.device.type == 'cuda':
+            held = torch.cuda.memory_allocated(self.device) / 1024.0 ** 2
+            told |= {'device': f'{self.device} {torch.cuda.get_device_name(self.device)}',
+                     'device memory [MiB]': f'{held:.0f}'}
+        return told
+
+
+def _estimate(window: Window, encodings: np.ndarray) -> Estimate:
+    """Turn the encodings (iterations, S, 9) of one window into poses in its anchor."""
+    with np.errstate(invalid='ignore', divide='ignore'):
+        before, T_camera_world = pose_encoding.transforms(encodings[-2:])
+    if not np.isfinite(T_camera_world).all():
+        return lost(window)
+    # The first frame is only nearly the model's world.
+    T_anchor_frame = T_camera_world[0] @ geometry.invert(T_camera_world)
+    T_anchor_frame[0] = np.eye(4)
+    fitted = window.frames[-1].payload.fit
+    K = pose_encoding.intrinsics(encodings[-1], fitted.rows, fitted.width)
+    return Estimate(T_anchor_frame, _covariance(before[0] @ geometry.invert(before),
+                                                T_anchor_frame),
+                    points=None, signals=np.zeros(0, dtype=np.float32),
+                    intrinsics=fitted.native(K[-1]))
+
+
+def _covariance(before: np.ndarray, T_anchor_frame: np.ndarray) -> np.ndarray:
+    """Doubt what the last refinement still changed, and a share of how far a frame is away.
+
+    The model tells no confidence of its poses. `before` and `T_anchor_frame` are the poses
+    (S, 4, 4) of the last two iterations; returns (S, 6, 6).
+    """
+    positions = T_anchor_frame[:, :3, 3]
+    distances = np.linalg.norm(positions, axis=1)
+    moved = np.linalg.norm(positions - before[:, :3, 3], axis=1)
+    turned = geometry.rotation_angle(geometry.relative(before, T_anchor_frame)[:, :3, :3])
+    translation = np.maximum(moved, TRANSLATION_DOUBT * distances + LEAST_DOUBT * distances.max())
+    rotation = np.maximum(turned, ROTATION_DOUBT)
+    deviations = np.repeat(np.column_stack([translation, rotation]), 3, axis=1)
+    deviations[0] = 0.0
+    return deviations[:, :, None] ** 2 * np.eye(6)

@@ -1,0 +1,81 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""A file of weights to a model: checked first, then read straight to its device and type."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+from torch import Tensor
+
+from kfvo_ros.backbones.vggt.config import config_of
+from kfvo_ros.backbones.vggt.model import Vggt
+from kfvo_ros.backbones.vggt.precision import set_precision
+from kfvo_ros.errors import KfvoError
+
+PARTS = ('aggregator.', 'camera_head.')
+"""What is built; the heads for depth, points and tracks of a full checkpoint are skipped."""
+AT_ONCE = 64
+"""Tensors read before the file is closed and opened anew: what is mapped counts as memory."""
+FLOATS = (torch.float32, torch.float16, torch.bfloat16, torch.float64)
+SHOWN = 3
+"""So many keys that differ are named."""
+
+
+def load_model(path: Path, device: torch.device, dtype: torch.dtype) -> Vggt:
+    """Return the model in a ``.safetensors`` or ``.pt`` file, on `device`, ready to run.
+
+    `dtype` is that of `precision.set_precision`. The sizes are read off the tensors. Raises
+    KfvoError for a file that cannot be read, or that holds other tensors than a VGGT model's.
+    """
+    found = {name: each for name, each in _map(path).items() if name.startswith(PARTS)}
+    try:
+        config = config_of({name: tuple(each.shape) for name, each in found.items()})
+        with torch.device('meta'):
+            model = set_precision(Vggt(config), dtype)
+        wanted: dict[str, Tensor] = dict(model.named_parameters())
+        _compare(found, wanted)
+    except KfvoError as error:
+        raise KfvoError(f'{path}: {error}') from error
+    del found
+    names, loaded = list(wanted), dict[str, Tensor]()
+    for first in range(0, len(names), AT_ONCE):
+        mapped = _map(path)
+        loaded |= {name: mapped[name].to(device, wanted[name].dtype, copy=True)
+                   for name in names[first:first + AT_ONCE]}
+    model.load_state_dict(loaded, assign=True)
+    return model.eval().requires_grad_(False)
+
+
+def _map(path: Path) -> dict[str, Tensor]:
+    """Return the tensors of a file, mapped and not read yet; raises KfvoError."""
+    try:
+        if path.suffix == '.safetensors':
+            return load_file(path)
+        state = torch.load(path, map_location='cpu', weights_only=True, mmap=True)
+    except (OSError, SafetensorError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
+        reason = str(error).strip().splitlines()[0] if str(error).strip() else 'it is empty'
+        raise KfvoError(f'cannot read the weights in {path}; expected a whole .safetensors file, '
+                        f'or a .pt file of nothing but tensors: {reason}') from error
+    if not isinstance(state, dict) or not all(isinstance(each, Tensor) for each in state.values()):
+        raise KfvoError(f'{path}: expected tensors by name, as state_dict() gives them')
+    return state
+
+
+def _compare(found: dict[str, Tensor], wanted: dict[str, Tensor]) -> None:
+    """Raise KfvoError naming the first tensors that differ from what is wanted."""
+    wrong = [f'{name} is missing' for name in wanted if name not in found]
+    wrong += [f'{name} is unknown' for name in found if name not in wanted]
+    for name in (name for name in wanted if name in found):
+        if found[name].shape != wanted[name].shape:
+            wrong.append(f'{name} has the shape {list(found[name].shape)} instead of '
+                         f'{list(wanted[name].shape)}')
+        if found[name].dtype not in FLOATS:
+            wrong.append(f'{name} is of {found[name].dtype}, which is no floating point type')
+    if wrong:
+        more = f' and {len(wrong) - SHOWN} more' if len(wrong) > SHOWN else ''
+        raise KfvoError(f'not the weights of a VGGT model: {", ".join(wrong[:SHOWN])}{more}')

@@ -1,0 +1,29 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The part of VGGT that poses need: 1.125 of 1.257 billion parameters."""
+
+from __future__ import annotations
+
+from torch import Tensor, nn
+
+from kfvo_ros.backbones.vggt.aggregator import Aggregator
+from kfvo_ros.backbones.vggt.camera_head import CameraHead
+from kfvo_ros.backbones.vggt.config import VggtConfig
+
+
+class Vggt(nn.Module):
+    """Visual geometry grounded transformer: images of a window to poses and fields of view.
+
+    Parameters are called as in the published checkpoints. Source: Wang et al., VGGT: Visual
+    Geometry Grounded Transformer, CVPR 2025.
+    """
+
+    def __init__(self, config: VggtConfig | None = None) -> None:
+        super().__init__()
+        self.config = config or VggtConfig()
+        self.aggregator = Aggregator(self.config)
+        self.camera_head = CameraHead(self.config)
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Return pose encodings (iterations, B, S, 9) of images (B, S, 3, H, W) in [0, 1]."""
+        return self.camera_head(self.aggregator(images))

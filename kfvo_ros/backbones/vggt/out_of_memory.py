@@ -1,0 +1,29 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Too little memory, told in one line."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+
+from kfvo_ros.errors import KfvoError
+
+CPU_ALLOCATOR = "can't allocate memory"
+"""What torch says where the processor's memory ends; it has no type of its own."""
+
+
+@contextmanager
+def memory_bounded(device: torch.device) -> Iterator[None]:
+    """Turn an allocation that failed into a KfvoError with the remedies."""
+    try:
+        yield
+    except (torch.OutOfMemoryError, MemoryError, RuntimeError) as error:
+        if type(error) is RuntimeError and CPU_ALLOCATOR not in str(error):
+            raise
+        if device.type == 'cuda':
+            torch.cuda.empty_cache()
+        raise KfvoError(f'the memory of {device} is full: make window_size or image_width '
+                        'smaller, or set precision to bf16') from error
