@@ -1,0 +1,180 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""``python -m kfvo_ros.backbones.vggt.benchmark``: what a step costs, in full and reusing.
+
+A step takes in one frame and places a window: as the published model does (plain), with a
+window that slides by one frame, and with one whose anchor is kept. The three run in turn in one
+process, with random weights and images.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+from torch import nn
+from torch.nn import functional
+
+from kfvo_ros.backbones.vggt.config import PATCH, VggtConfig
+from kfvo_ros.backbones.vggt.out_of_memory import memory_bounded
+from kfvo_ros.backbones.vggt.precision import PRECISIONS, choose_device, choose_dtype
+from kfvo_ros.backbones.vggt.rehearsal import STEPS, Scene, count_flops, random_model
+from kfvo_ros.errors import KfvoError
+from kfvo_ros.memory_use import peak_rss_mb
+
+Times = dict[str, list[float]]
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the benchmark; return its exit status."""
+    arguments = _parse(argv)
+    try:
+        device = choose_device(arguments.device)
+        with torch.inference_mode(), memory_bounded(device):
+            _run(arguments, device)
+    except KfvoError as error:
+        print(f'vggt benchmark: error: {error}', file=sys.stderr)
+        return 1
+    return 0
+
+
+def _parse(argv: list[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog='python -m kfvo_ros.backbones.vggt.benchmark',
+                                     description=__doc__)
+    parser.add_argument('--size', type=_size, default=(392, 518), metavar='HxW',
+                        help='size of the images, multiples of 14 (default: 392x518)')
+    parser.add_argument('--frames', type=int, default=8, help='frames of a window '
+                        '(default: %(default)s)')
+    parser.add_argument('--precision', choices=('auto', *PRECISIONS), default='auto')
+    parser.add_argument('--against', choices=('same', 'fp32', 'official'), default='same',
+                        help='what computes the plain step: the same model, one in fp32, or one '
+                        'with fp32 weights under bfloat16 autocast, as published')
+    parser.add_argument('--device', default='auto')
+    parser.add_argument('--rounds', type=int, default=7, help='each kind of step is timed so '
+                        'often (default: %(default)s)')
+    arguments = parser.parse_args(argv)
+    if arguments.frames < 2 or arguments.rounds < 1:
+        parser.error('expected at least two frames and one round')
+    return arguments
+
+
+def _size(text: str) -> tuple[int, int]:
+    height, _, width = text.partition('x')
+    size = (int(height), int(width))
+    if min(size) < PATCH or size[0] % PATCH or size[1] % PATCH:
+        raise argparse.ArgumentTypeError(f'expected HxW in multiples of {PATCH}, came {text}')
+    return size
+
+
+def _run(arguments: argparse.Namespace, device: torch.device) -> None:
+    """Time the steps and print the table."""
+    dtype = choose_dtype(arguments.precision, device)
+    shape: tuple[int, int, int] = (*arguments.size, arguments.frames)
+    ours = Scene(random_model(device, dtype), *shape)
+    official = arguments.against == 'official'
+    plain = ours if arguments.against == 'same' else Scene(
+        random_model(device, torch.float32), *shape, autocast=official)
+    times = _time(plain, ours, arguments.rounds)
+    rates = {each: _matmul_rate(each, device, shape)
+             for each in {dtype, torch.float32 if plain is not ours else dtype}}
+    name = torch.cuda.get_device_name(device) if device.type == 'cuda' else \
+        f'{torch.get_num_threads()} threads'
+    print(f'{device} ({name}), torch {torch.__version__}, {shape[2]} frames of '
+          f'{shape[0]}x{shape[1]}, matrices in {dtype}, plain in '
+          f'{"autocast" if official else "fp32" if plain is not ours else dtype}')
+    print(f'{"step":12} {"ms":>9} {"ratio":>6} {"TFLOP":>7} {"share":>6} {"of matmul":>9}')
+    whole = count_flops(STEPS['plain'], *shape)
+    for kind, step in STEPS.items():
+        flops = count_flops(step, *shape)
+        median = statistics.median(times[kind])
+        ratio = statistics.median(map(float.__truediv__, times['plain'], times[kind]))
+        rate = rates[torch.float32 if kind == 'plain' and plain is not ours else dtype]
+        print(f'{kind:12} {1e3 * median:9.1f} {ratio:5.2f}x {flops / 1e12:7.2f} '
+              f'{flops / whole:6.3f} {flops / median / rate:9.2f}')
+    for kind in ('sliding', 'anchor kept'):
+        print(f'{kind}: ' + ', '.join(f'{part} {100 * share:.1f} %'
+                                      for part, share in _shares(ours, kind).items()))
+    print(f'matmul rate {rates[dtype] / 1e12:.3f} TFLOP/s, peak memory '
+          f'{_peak_memory_mb(device):.0f} MiB')
+
+
+def _time(plain: Scene, ours: Scene, rounds: int) -> Times:
+    """Return the seconds of each kind of step, run in turn after a round to warm up."""
+    times: Times = {kind: [] for kind in STEPS}
+    for _ in range(rounds + 1):
+        for kind, step in STEPS.items():
+            scene = plain if kind == 'plain' else ours
+            start = _now(ours.device)
+            step(scene)
+            times[kind].append(_now(ours.device) - start)
+    return {kind: seconds[1:] for kind, seconds in times.items()}
+
+
+def _shares(scene: Scene, kind: str) -> dict[str, float]:
+    """Return the share of each part in a step's time."""
+    model, device = scene.model, scene.device
+    spent = {'encode': 0.0, 'frame': 0.0, 'head': 0.0}
+    with _timed(spent, 'encode', model.aggregator.patch_embed, device), \
+            _timed(spent, 'frame', model.aggregator.frame_blocks, device), \
+            _timed(spent, 'head', model.camera_head, device):
+        start = _now(device)
+        STEPS[kind](scene)
+        total = _now(device) - start
+    spent['global and rest'] = total - sum(spent.values())
+    return {part: seconds / total for part, seconds in spent.items()}
+
+
+@contextmanager
+def _timed(spent: dict[str, float], part: str, module: nn.Module,
+           device: torch.device) -> Iterator[None]:
+    """Add to ``spent[part]`` what a module takes, or each module of a list."""
+    def begin(*_: object) -> None:
+        spent[part] -= _now(device)
+
+    def end(*_: object) -> None:
+        spent[part] += _now(device)
+
+    modules = module if isinstance(module, nn.ModuleList) else [module]
+    hooks = [hook for each in modules for hook in (
+        each.register_forward_pre_hook(begin), each.register_forward_hook(end))]
+    try:
+        yield
+    finally:
+        for hook in hooks:
+            hook.remove()
+
+
+def _matmul_rate(dtype: torch.dtype, device: torch.device, shape: tuple[int, ...]) -> float:
+    """Return the operations per second of the model's largest multiplication [1/s]."""
+    width = VggtConfig().width
+    tokens = shape[2] * shape[0] * shape[1] // PATCH ** 2
+    x = torch.randn(tokens, width, device=device, dtype=dtype)
+    weight = torch.randn(4 * width, width, device=device, dtype=dtype)
+    seconds = []
+    for _ in range(8):
+        start = _now(device)
+        functional.linear(x, weight)
+        seconds.append(_now(device) - start)
+    return 2.0 * tokens * 4 * width ** 2 / statistics.median(seconds[1:])
+
+
+def _now(device: torch.device) -> float:
+    """Return the time [s] at which all that was asked of the device is done."""
+    if device.type == 'cuda':
+        torch.cuda.synchronize(device)
+    return time.perf_counter()
+
+
+def _peak_memory_mb(device: torch.device) -> float:
+    if device.type == 'cuda':
+        return torch.cuda.max_memory_allocated(device) / 1024.0 ** 2
+    return peak_rss_mb()
+
+
+if __name__ == '__main__':
+    sys.exit(main())
