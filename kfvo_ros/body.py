@@ -14,13 +14,11 @@ import numpy as np
 
 from kfvo_ros import geometry
 from kfvo_ros.live import LivePose
-from kfvo_ros.trajectory import NANOSECONDS
+from kfvo_ros.trajectory import NANOSECONDS, UNKNOWN_VARIANCE
 
 T_BODY_OPTICAL = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0],
                            [0.0, 0.0, 0.0, 1.0]])
 """An optical frame (x right, y down, z forward) on a body in its place (REP-103)."""
-UNKNOWN_VARIANCE = 1e4
-"""Variance of a velocity of which nothing is known."""
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import yaml
 
-from kfvo_ros.errors import KfvoError
+from kfvo_ros.errors import KfvoError, reason_of
 
 DISTORTION_SIZES = {'none': (0,), 'plumb_bob': (4, 5), 'rational_polynomial': (8,),
                     'equidistant': (4,)}
@@ -194,8 +194,7 @@ def read_camera_info(path: Path) -> Camera:
     try:
         document = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
     except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError) as error:
-        problem = ' '.join(str(error).split())
-        raise KfvoError(f'cannot read the calibration {path}: {problem}') from error
+        raise KfvoError(f'cannot read the calibration {path}: {reason_of(error)}') from error
     try:
         fx, _, cx, _, fy, cy = _matrix(document, 'camera_matrix', 9)[:6]
         return Camera(int(document['image_width']), int(document['image_height']), fx, fy, cx,
@@ -225,7 +224,7 @@ def write_camera_info(path: Path, camera: Camera) -> None:
     try:
         path.write_text(text, encoding='utf-8')
     except OSError as error:
-        raise KfvoError(f'cannot write the calibration {path}: {error.strerror}') from error
+        raise KfvoError(f'cannot write the calibration {path}: {reason_of(error)}') from error
 
 
 def _matrix(document: dict[str, Any], key: str, size: int | None) -> tuple[float, ...]:

@@ -18,7 +18,8 @@ def find_config(name: str) -> Path:
         return given
     package = Path(__file__).resolve().parent
     # colcon's prefix holds lib/pythonX/site-packages/kfvo_ros.
-    prefixes: list[str | Path] = [*os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep),
-                                  sys.prefix, *package.parents[2:4]]
-    folders = [package.parent / 'config', *(Path(prefix) / FOLDER for prefix in prefixes)]
+    prefixes = [*os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep), sys.prefix,
+                *map(str, package.parents[2:4])]
+    folders = [package.parent / 'config',
+               *(Path(prefix) / FOLDER for prefix in prefixes if prefix)]
     return next((folder / name for folder in folders if (folder / name).is_file()), given)

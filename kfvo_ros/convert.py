@@ -5,19 +5,16 @@
 from __future__ import annotations
 
 import argparse
-import logging
 import os
 import shlex
-import signal
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from kfvo_ros import __version__
+from kfvo_ros.commands import make_parser, run_command
 from kfvo_ros.errors import KfvoError
+from kfvo_ros.interruption import signals_collected
 
 EXAMPLES = """examples:
   python -m kfvo_ros.convert V1_01_easy bags/V1_01 --topic /cam0/image_raw
@@ -32,34 +29,22 @@ else a bag recorded, an IMU or other cameras, stays behind. Bag time is the stam
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command; return its exit status."""
-    logging.basicConfig(format='kfvo_convert: %(levelname)s: %(message)s', level=logging.WARNING)
-    try:
-        return _convert(argv)
-    except ModuleNotFoundError as error:
-        from kfvo_ros.requirements import missing_dependency
-        problem: Exception = missing_dependency(error)
-    except KfvoError as error:
-        problem = error
-    except KeyboardInterrupt:
-        problem = KfvoError('interrupted before the first image')
-    print(f'kfvo_convert: error: {problem}', file=sys.stderr)
-    return 1
+    return run_command('kfvo_convert', _convert, argv)
 
 
-def _convert(argv: list[str] | None) -> int:
+def _convert(argv: list[str]) -> None:
     # The heavy imports come after the arguments were checked: --help answers at once.
     arguments = _parse(argv)
     from kfvo_ros.options import SequenceOptions, from_arguments
     from kfvo_ros.recording.bag_writer import BagWriter
     options = from_arguments(SequenceOptions, arguments)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
     writer = BagWriter(Path(os.path.abspath(arguments.bag)), arguments.zstd,
                        arguments.metadata_version)
     from kfvo_ros.assembly import make_sequence
     from kfvo_ros.recording.recorder import Recorder
     sequence = make_sequence(arguments.sequence, options)
     recorder = Recorder(sequence, writer, arguments.topic, arguments.compressed)
-    with _interrupts_held() as interrupts:
+    with signals_collected() as interrupts:
         problem = _record(sequence, recorder, options.stop, interrupts)
         if recorder.frame_count == 0:
             writer.discard()
@@ -67,17 +52,15 @@ def _convert(argv: list[str] | None) -> int:
         recorder.finish(complete=not problem and recorder.frame_count != options.stop)
     print(_describe(writer, recorder, arguments.bag))
     if problem:
-        print(f'kfvo_convert: error: {problem}; the {recorder.frame_count} images before that are '
-              f'in {arguments.bag}', file=sys.stderr)
-    return 1 if problem else 0
+        raise KfvoError(f'{problem}; the {recorder.frame_count} images before that are in '
+                        f'{arguments.bag}')
 
 
-def _parse(argv: list[str] | None) -> argparse.Namespace:
+def _parse(argv: list[str]) -> argparse.Namespace:
     from kfvo_ros.options import SequenceOptions, add_arguments
     from kfvo_ros.recording import CODECS
-    parser = argparse.ArgumentParser(
-        prog='kfvo_convert', description='Write any sequence as a bag that "ros2 bag play" plays.',
-        epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(
+        'kfvo_convert', 'Write any sequence as a bag that "ros2 bag play" plays.', EXAMPLES)
     parser.add_argument('sequence', help='dataset folder, ROS 1 or 2 bag, folder of images, '
                         'video, or synthetic:SEED[:smooth|fast|mixed]')
     parser.add_argument('bag', help='folder to create; an existing one is never touched')
@@ -89,23 +72,8 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument('--zstd', action='store_true', help='compress the chunks of the file')
     parser.add_argument('--metadata-version', type=int, choices=(8, 9), default=9,
                         help='8 for ROS 2 before Jazzy (default: 9)')
-    parser.add_argument('--version', action='version', version=f'kfvo_ros {__version__}')
     add_arguments(parser, SequenceOptions)
     return parser.parse_args(argv)
-
-
-@contextmanager
-def _interrupts_held() -> Iterator[list[int]]:
-    """Collect Ctrl-C and SIGTERM instead of raising: no message is cut in the middle."""
-    received: list[int] = []
-    previous = {number: signal.signal(number, lambda number, _: received.append(number))
-                for number in (signal.SIGINT, signal.SIGTERM)
-                if signal.getsignal(number) != signal.SIG_IGN}  # as nohup and & want it
-    try:
-        yield received
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
 
 
 def _record(sequence: Any, recorder: Any, stop: int | None, interrupts: list[int]) -> str | None:

@@ -8,21 +8,15 @@ the trajectory is compared with the truth.
 
 from __future__ import annotations
 
-import argparse
 import json
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from kfvo_ros import __version__
+from kfvo_ros.commands import make_parser, run_command
 from kfvo_ros.errors import KfvoError
-from kfvo_ros.rehearsal import Heard, rehearse
-from kfvo_ros.sequences import open_sequence
-from kfvo_ros.trajectory import Trajectory, read_tum
 
 SEQUENCE = 'synthetic:8:smooth'
 BAG, TRAJECTORY, SUMMARY, PICTURE = 'bag', 'trajectory.tum', 'summary.json', 'trajectory.png'
@@ -30,29 +24,25 @@ BAG, TRAJECTORY, SUMMARY, PICTURE = 'bag', 'trajectory.tum', 'summary.json', 'tr
 
 def main(argv: list[str] | None = None) -> int:
     """Run the demonstration; return its exit status."""
-    parser = argparse.ArgumentParser(prog='kfvo_demo', description=__doc__)
+    return run_command('kfvo_demo', _run, argv)
+
+
+def _run(argv: list[str]) -> None:
+    parser = make_parser('kfvo_demo', __doc__ or '')
     parser.add_argument('--output', default='demo', help='folder, emptied of earlier results')
     parser.add_argument('--sequence', default=SEQUENCE, help='synthetic:SEED[:STYLE], or whatever '
                         'kfvo_convert takes and has ground truth (default: %(default)s)')
     arguments = parser.parse_args(argv)
-    try:
-        summary = _demonstrate(arguments.sequence, Path(arguments.output))
-    except ImportError as error:
-        from kfvo_ros.requirements import missing_dependency
-        print(f'kfvo_demo: error: {missing_dependency(error)}', file=sys.stderr)
-        return 1
-    except (KfvoError, subprocess.SubprocessError) as error:
-        print(f'kfvo_demo: error: {error}', file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        return 1
-    print(_table(summary, Path(arguments.output)))
-    return 0
+    folder = Path(arguments.output)
+    print(_table(_demonstrate(arguments.sequence, folder), folder))
 
 
 def _demonstrate(text: str, folder: Path) -> dict[str, Any]:
     """Convert, play, listen and evaluate; return the summary."""
+    # The heavy imports come after the arguments were checked: --help answers at once.
     from kfvo_ros import convert
+    from kfvo_ros.rehearsal import rehearse
+    from kfvo_ros.sequences import open_sequence
     sequence = open_sequence(text)
     truth = sequence.ground_truth()
     if truth is None:
@@ -70,11 +60,14 @@ def _demonstrate(text: str, folder: Path) -> dict[str, Any]:
     return _evaluate(folder, text, truth.trajectory, heard)
 
 
-def _evaluate(folder: Path, text: str, truth: Trajectory, heard: Heard) -> dict[str, Any]:
+def _evaluate(folder: Path, text: str, truth: Any, heard: Any) -> dict[str, Any]:
     """Write summary and picture."""
+    import numpy as np
+
     from kfvo_ros.plots import plot_trajectory
     from kfvo_ros.results import evaluate
     from kfvo_ros.sequences.base import GroundTruth
+    from kfvo_ros.trajectory import read_tum
     estimate = read_tum(folder / TRAJECTORY)
     summary = {
         'sequence': text, 'version': __version__, 'frames': heard.received,

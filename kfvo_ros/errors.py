@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The one exception that a user is meant to read."""
+"""The one exception that a user is meant to read, and the words of all others."""
 
 
 class KfvoError(Exception):
@@ -9,3 +9,12 @@ class KfvoError(Exception):
     The message says what was expected, what came and what to do. Commands print it without a
     traceback and exit with status 1; everything already computed is kept.
     """
+
+
+def reason_of(error: Exception) -> str:
+    """Return what an error of somebody else says, in one line.
+
+    Of an OSError that is the reason alone: whoever reports it names the file.
+    """
+    text = (isinstance(error, OSError) and error.strerror) or str(error)
+    return ' '.join(text.split()) or type(error).__name__

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from kfvo_ros.errors import KfvoError
+from kfvo_ros.errors import KfvoError, reason_of
 
 Bytes = bytes | bytearray | memoryview | array | np.ndarray
 """What ROS clients and bag readers hand out as uint8[]."""
@@ -111,7 +111,7 @@ def read_image(path: Path) -> np.ndarray:
     try:
         return decode_compressed(Path(path).read_bytes())
     except OSError as error:
-        raise KfvoError(f'cannot read the image {path}: {error.strerror}') from error
+        raise KfvoError(f'cannot read the image {path}: {reason_of(error)}') from error
     except KfvoError as error:
         raise KfvoError(f'cannot read the image {path}: {error}') from error
 

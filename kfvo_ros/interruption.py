@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""SIGINT and SIGTERM as one exception, for commands whose usual end they are."""
+"""SIGINT and SIGTERM: as one exception, held back, collected or ignored."""
 
 from __future__ import annotations
 
@@ -20,10 +20,15 @@ class Interrupted(KeyboardInterrupt):
     """
 
 
-def raise_on_signals() -> None:
-    """Let either signal raise Interrupted in the main thread."""
+def raise_on_signals(even_ignored: bool) -> None:
+    """Let either signal raise Interrupted in the main thread.
+
+    A signal that this process was started to ignore, as shells start what a script puts in the
+    background, does so only if `even_ignored`.
+    """
     for number in SIGNALS:
-        signal.signal(number, _interrupt)
+        if even_ignored or signal.getsignal(number) != signal.SIG_IGN:
+            signal.signal(number, _interrupt)
 
 
 def ignore_signals() -> None:
@@ -40,6 +45,19 @@ def signals_held() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
+
+
+@contextmanager
+def signals_collected() -> Iterator[list[int]]:
+    """Give a list that grows by each signal, which raises nothing and cuts nothing in two."""
+    received: list[int] = []
+    previous = {number: signal.signal(number, lambda number, _: received.append(number))
+                for number in SIGNALS if signal.getsignal(number) != signal.SIG_IGN}
+    try:
+        yield received
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
 
 
 def _interrupt(number: int, frame: Any) -> None:

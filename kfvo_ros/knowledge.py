@@ -45,9 +45,9 @@ class Knowledge:
 
 
 def scaled(poses: np.ndarray, scale: float) -> np.ndarray:
-    """Return poses (N, 4, 4) in another unit."""
+    """Return poses (..., 4, 4) in another unit."""
     result = poses.copy()
-    result[:, :3, 3] *= scale
+    result[..., :3, 3] *= scale
     return result
 
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from kfvo_ros import geometry
 from kfvo_ros.backbones.base import Status
+from kfvo_ros.knowledge import scaled
 from kfvo_ros.odometry import KeyframeOdometry, Placed
 from kfvo_ros.sequences.base import Frame
 from kfvo_ros.trajectory_log import TrajectoryLog
@@ -109,9 +110,7 @@ class LiveOdometry:
 
     def _metric(self, pose: np.ndarray) -> np.ndarray:
         """Return a pose (4, 4) of trajectory units in metres."""
-        scaled = pose.copy()
-        scaled[:3, 3] *= self._scale
-        return scaled
+        return scaled(pose, self._scale)
 
     def _doubt(self, covariance: np.ndarray) -> np.ndarray:
         """Return what the backbone doubts, in metres, and what windows disagree on."""

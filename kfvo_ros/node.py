@@ -4,13 +4,11 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 
-from kfvo_ros import __version__
-from kfvo_ros.errors import KfvoError
-from kfvo_ros.interruption import Interrupted, ignore_signals, raise_on_signals, signals_held
+from kfvo_ros.commands import make_parser, run_command
+from kfvo_ros.interruption import Interrupted, ignore_signals, signals_held
 
 EXAMPLES = """examples:
   kfvo_node --ros-args -r image:=/camera/image_raw
@@ -20,19 +18,7 @@ EXAMPLES = """examples:
 
 def main(argv: list[str] | None = None) -> int:
     """Run the node until a signal ends it; return the exit status."""
-    raise_on_signals()
-    try:
-        _run(sys.argv[1:] if argv is None else argv)
-        return 0
-    except ImportError as error:
-        from kfvo_ros.requirements import missing_dependency
-        problem = missing_dependency(error)
-    except KfvoError as error:
-        problem = error
-    except Interrupted:
-        return 0  # the usual end of a node
-    print(f'kfvo_node: error: {problem}', file=sys.stderr)
-    return 1
+    return run_command('kfvo_node', _run, argv, until_stopped=True)
 
 
 def _run(argv: list[str]) -> None:
@@ -55,12 +41,8 @@ def _run(argv: list[str]) -> None:
 def _parse(argv: list[str]) -> None:
     from kfvo_ros.options import OdometryOptions
     from kfvo_ros.ros.parameters import NodeOptions, describe
-    parser = argparse.ArgumentParser(
-        prog='kfvo_node', description='Visual odometry of one camera. All choices are ROS '
-        'parameters:\n\n' + describe(NodeOptions, OdometryOptions), epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('--version', action='version', version=f'kfvo_ros {__version__}')
-    parser.parse_args(argv)
+    make_parser('kfvo_node', 'Visual odometry of one camera. All choices are ROS parameters:\n\n'
+                + describe(NodeOptions, OdometryOptions), EXAMPLES).parse_args(argv)
 
 
 if __name__ == '__main__':

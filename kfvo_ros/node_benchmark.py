@@ -7,7 +7,6 @@ A room rendered at EuRoC's 752x480 goes to the node at 20 Hz, then at twice the 
 
 from __future__ import annotations
 
-import argparse
 import sys
 import tempfile
 import time
@@ -15,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from kfvo_ros.errors import KfvoError
+from kfvo_ros.commands import make_parser, run_command
 from kfvo_ros.rehearsal import Heard, rehearse
 
 RATE_HZ, RENDERED_HZ = 20.0, 30.0
@@ -25,21 +24,16 @@ OFFLINE_FRAMES = 300
 
 def main(argv: list[str] | None = None) -> int:
     """Run the benchmark; return its exit status."""
-    parser = argparse.ArgumentParser(prog='kfvo_node_benchmark', description=__doc__)
+    return run_command('kfvo_node_benchmark', _run, argv)
+
+
+def _run(argv: list[str]) -> None:
+    parser = make_parser('kfvo_node_benchmark', __doc__ or '')
     parser.add_argument('--seconds', type=float, default=60.0, help='length of the stream '
                         '(default: %(default)s)')
     arguments = parser.parse_args(argv)
-    try:
-        with tempfile.TemporaryDirectory() as folder:
-            _compare(Path(folder, 'bag'), max(2, round(RATE_HZ * arguments.seconds)))
-    except ImportError as error:
-        from kfvo_ros.requirements import missing_dependency
-        print(f'kfvo_node_benchmark: error: {missing_dependency(error)}', file=sys.stderr)
-        return 1
-    except KfvoError as error:
-        print(f'kfvo_node_benchmark: error: {error}', file=sys.stderr)
-        return 1
-    return 0
+    with tempfile.TemporaryDirectory() as folder:
+        _compare(Path(folder, 'bag'), max(2, round(RATE_HZ * arguments.seconds)))
 
 
 def _compare(bag: Path, count: int) -> None:

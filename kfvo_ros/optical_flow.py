@@ -11,8 +11,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-SEARCH = {'winSize': (21, 21), 'criteria': (3, 10, 0.03)}
-REFINEMENT = {'winSize': (11, 11), 'criteria': (3, 30, 0.01), 'maxLevel': 0}
+STEPS_OR_STEP = cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS
+SEARCH = {'winSize': (21, 21), 'criteria': (STEPS_OR_STEP, 10, 0.03)}
+REFINEMENT = {'winSize': (11, 11), 'criteria': (STEPS_OR_STEP, 30, 0.01), 'maxLevel': 0}
 NEAR_LEVELS, FAR_LEVELS, BACKWARD_LEVELS = 2, 4, 1
 """Halvings of the image for a search from a prediction, from nothing, and back."""
 MAX_ROUND_TRIP = 0.7

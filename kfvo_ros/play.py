@@ -10,9 +10,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from kfvo_ros import __version__
+from kfvo_ros.commands import make_parser, run_command
 from kfvo_ros.errors import KfvoError
-from kfvo_ros.interruption import Interrupted, ignore_signals, raise_on_signals, signals_held
+from kfvo_ros.interruption import Interrupted, ignore_signals, signals_held
 
 EXAMPLES = """examples:
   python -m kfvo_ros.play MH_01_easy.bag --wait-for-subscribers
@@ -26,21 +26,10 @@ _log = logging.getLogger('kfvo_ros.play')  # not __main__, as which it is run
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command; return its exit status."""
+    # Unlike the other commands it also tells what it does, and no line needs a level.
     logging.basicConfig(format='kfvo_play: %(message)s', level=logging.WARNING)
     logging.getLogger('kfvo_ros').setLevel(logging.INFO)
-    raise_on_signals()
-    try:
-        _run(sys.argv[1:] if argv is None else argv)
-        return 0
-    except ImportError as error:
-        from kfvo_ros.requirements import missing_dependency
-        problem = missing_dependency(error)
-    except KfvoError as error:
-        problem = error
-    except Interrupted:
-        return 0  # the usual end of a player
-    print(f'kfvo_play: error: {problem}', file=sys.stderr)
-    return 1
+    return run_command('kfvo_play', _run, argv, until_stopped=True)
 
 
 def _run(argv: list[str]) -> None:
@@ -68,11 +57,8 @@ def _run(argv: list[str]) -> None:
 
 def _parse(argv: list[str]) -> argparse.Namespace:
     from kfvo_ros.options import PlayOptions, add_arguments
-    parser = argparse.ArgumentParser(
-        prog='kfvo_play', description='Play a bag onto ROS topics.', epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser('kfvo_play', 'Play a bag onto ROS topics.', EXAMPLES)
     parser.add_argument('bag', help='ROS 1 .bag, ROS 2 folder with metadata.yaml, .mcap or .db3')
-    parser.add_argument('--version', action='version', version=f'kfvo_ros {__version__}')
     add_arguments(parser, PlayOptions)
     if '--ros-args' in argv:
         from kfvo_ros.ros.session import without_ros_arguments

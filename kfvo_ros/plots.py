@@ -7,7 +7,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -15,8 +14,6 @@ from kfvo_ros import metrics
 from kfvo_ros.trajectory import Trajectory, associate
 
 TRUTH, ESTIMATE = '#d62728', '#1f4e9c'
-
-matplotlib.use('Agg')
 
 
 def plot_trajectory(path: Path, estimate: Trajectory, truth: Trajectory,

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from kfvo_ros.errors import KfvoError
+from kfvo_ros.interruption import signals_held
 
 SETTLED_S, PATIENCE_S = 1.5, 60.0
 """Without a new pose for so long the node has caught up; it is waited for so long at most."""
@@ -37,8 +38,9 @@ def rehearse(bag: Path, topic: str, parameters: dict[str, object], rate: float =
     # Of its own, so that no other robot in the network hears or disturbs it.
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     os.environ.setdefault('ROS_DOMAIN_ID', str(1 + os.getpid() % 100))
-    from kfvo_ros.ros.session import spinning
-    from kfvo_ros.ros.witness import Witness
+    with signals_held():
+        from kfvo_ros.ros.session import spinning
+        from kfvo_ros.ros.witness import Witness
     choices = {'image_topic': topic, **parameters}
     given = [text for name, value in choices.items() for text in ('-p', f'{name}:={value}')]
     with spinning(Witness, []) as witness, subprocess.Popen(

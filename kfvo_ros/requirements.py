@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from kfvo_ros.errors import KfvoError
+from kfvo_ros.errors import KfvoError, reason_of
 
 PIP_NAMES = {'cv2': 'opencv-python-headless', 'mcap': 'mcap', 'numba': 'numba',
              'numpy': 'numpy', 'poselib': 'poselib', 'rosbags': 'rosbags',
@@ -22,16 +22,18 @@ ROS_MODULES = frozenset(('rclpy', 'rcl_interfaces', 'rosgraph_msgs', 'sensor_msg
 
 
 def missing_dependency(error: ImportError) -> KfvoError:
-    """Return the one line to show for an import that failed.
+    """Return the one line to show for a module that is missing, or is there and does not load.
 
     Raises the error itself when no package of setup.py would bring the module: that is a
     mistake of ours, not of the installation.
     """
     module = (error.name or '').partition('.')[0]
+    problem = 'is missing' if isinstance(error, ModuleNotFoundError) else \
+        f'cannot be imported ({reason_of(error)})'
     if module in ROS_MODULES:
-        return KfvoError(f"{module} is missing: source /opt/ros/jazzy/setup.bash, or pip install "
+        return KfvoError(f"{module} {problem}: source /opt/ros/jazzy/setup.bash, or pip install "
                          "'kfvo_ros[ros]' where there is none")
     packages = PIP_NAMES | OPTIONAL_PIP_NAMES
     if module not in packages:
         raise error
-    return KfvoError(f'{module} is missing: pip install {packages[module]}')
+    return KfvoError(f'{module} {problem}: pip install {packages[module]}')

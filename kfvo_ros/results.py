@@ -5,7 +5,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import numpy as np
 
 from kfvo_ros import metrics
 from kfvo_ros.backbones.base import Status
-from kfvo_ros.errors import KfvoError
+from kfvo_ros.errors import KfvoError, reason_of
 from kfvo_ros.memory_use import peak_rss_mb
 from kfvo_ros.odometry import Placed, Update
 from kfvo_ros.sequences.base import GroundTruth
@@ -25,8 +26,8 @@ TRAJECTORY, KEYFRAMES, SUMMARY = 'trajectory.tum', 'keyframes.tum', 'summary.jso
 class ResultWriter:
     """Writes poses as they become final and counts what happened.
 
-    Raises KfvoError when the folder cannot be written, or holds results and `overwrite` is not
-    set.
+    Raises KfvoError when the folder holds results and `overwrite` is not set, and when it cannot
+    be written, now or later.
     """
 
     def __init__(self, folder: Path, overwrite: bool = False) -> None:
@@ -41,7 +42,8 @@ class ResultWriter:
             self._keyframes = (folder / KEYFRAMES).open('w', encoding='ascii')
             (folder / SUMMARY).unlink(missing_ok=True)
         except OSError as error:
-            raise KfvoError(f'cannot write to {folder}: {error.strerror}') from error
+            raise KfvoError(f'cannot write to {folder}: {reason_of(error)}') from error
+        self._failure: KfvoError | None = None
         self._placed_stamps: list[int] = []
         self._placed_poses: list[np.ndarray] = []
         self._durations: dict[str, list[float]] = {}
@@ -64,21 +66,23 @@ class ResultWriter:
 
     def append(self, final: Iterable[Placed]) -> None:
         """Append final poses to the files, so that nothing computed is ever lost."""
-        for placed in final:
-            pose = placed.T_world_camera
-            line = format_tum_line(placed.stamp_ns, pose)
-            self._trajectory.write(line)
-            if placed.is_keyframe:
-                self._keyframes.write(line)
-            self._placed_stamps.append(placed.stamp_ns)
-            self._placed_poses.append(pose)
-        self._trajectory.flush()
-        self._keyframes.flush()
+        with self._told():
+            for placed in final:
+                pose = placed.T_world_camera
+                line = format_tum_line(placed.stamp_ns, pose)
+                self._trajectory.write(line)
+                if placed.is_keyframe:
+                    self._keyframes.write(line)
+                self._placed_stamps.append(placed.stamp_ns)
+                self._placed_poses.append(pose)
+            self._trajectory.flush()
+            self._keyframes.flush()
 
     def finish(self, about: dict[str, Any], truth: GroundTruth | None) -> dict[str, Any]:
         """Write summary.json, close the files and return the summary."""
-        self._trajectory.close()
-        self._keyframes.close()
+        with self._told():
+            self._trajectory.close()
+            self._keyframes.close()
         estimate = Trajectory(np.array(self._placed_stamps, dtype=np.int64),
                               np.array(self._placed_poses).reshape(-1, 4, 4))
         summary = {
@@ -91,7 +95,8 @@ class ResultWriter:
             'max_rotation_deg': metrics.max_rotation_deg(estimate) if len(estimate) else 0.0,
             **self._camera_seen(), **evaluate(estimate, truth)}
         text = json.dumps(summary, indent=2, allow_nan=False)
-        (self.folder / SUMMARY).write_text(text + '\n', encoding='utf-8')
+        with self._told():
+            (self.folder / SUMMARY).write_text(text + '\n', encoding='utf-8')
         return summary
 
     def _camera_seen(self) -> dict[str, dict[str, float | None]]:
@@ -103,6 +108,20 @@ class ResultWriter:
         return {'estimated_intrinsics': {
             name: float(value) if np.isfinite(value) else None
             for name, value in zip(('fx', 'fy', 'cx', 'cy'), K[[0, 1, 0, 1], [0, 1, 2, 2]])}}
+
+    @contextmanager
+    def _told(self) -> Iterator[None]:
+        """Turn a failure to write into a KfvoError, then and ever after: a line may be torn."""
+        if self._failure is not None:
+            raise self._failure
+        try:
+            yield
+        except OSError as error:
+            for file in (self._trajectory, self._keyframes):
+                with suppress(OSError):  # what it still holds fails again
+                    file.close()
+            self._failure = KfvoError(f'cannot write to {self.folder}: {reason_of(error)}')
+            raise self._failure from error
 
     def _milliseconds(self) -> dict[str, dict[str, float]]:
         """Return median and 95th percentile of each step and of their sum."""

@@ -5,15 +5,15 @@
 from __future__ import annotations
 
 import argparse
-import logging
-import signal
 import sys
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 from kfvo_ros import __version__
+from kfvo_ros.commands import make_parser, run_command
 from kfvo_ros.errors import KfvoError
+from kfvo_ros.interruption import signals_collected
 
 EXAMPLES = """examples:
   python -m kfvo_ros.run synthetic:7 --output out
@@ -24,21 +24,10 @@ EXAMPLES = """examples:
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command; return its exit status."""
-    logging.basicConfig(format='kfvo_run: %(levelname)s: %(message)s', level=logging.WARNING)
-    try:
-        return _run(argv)
-    except ModuleNotFoundError as error:
-        from kfvo_ros.requirements import missing_dependency
-        problem: Exception = missing_dependency(error)
-    except KfvoError as error:
-        problem = error
-    except KeyboardInterrupt:
-        problem = KfvoError('interrupted before the first frame')
-    print(f'kfvo_run: error: {problem}', file=sys.stderr)
-    return 1
+    return run_command('kfvo_run', _run, argv)
 
 
-def _run(argv: list[str] | None) -> int:
+def _run(argv: list[str]) -> None:
     # The heavy imports come after the arguments were checked: --help answers at once.
     from kfvo_ros.options import OdometryOptions, SequenceOptions, VggtOptions, from_arguments
     arguments = _parse(argv)
@@ -47,7 +36,6 @@ def _run(argv: list[str] | None) -> int:
     from kfvo_ros.threads import single_threaded
     odometry_options = from_arguments(OdometryOptions, arguments)
     sequence_options = from_arguments(SequenceOptions, arguments)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
     with single_threaded():
         sequence = assembly.make_sequence(arguments.sequence, sequence_options)
         odometry = assembly.make_odometry(odometry_options, assembly.make_backbone(
@@ -55,30 +43,26 @@ def _run(argv: list[str] | None) -> int:
         truth = sequence.ground_truth()
         writer = ResultWriter(Path(arguments.output), arguments.overwrite)
         problem = _process(sequence, odometry, writer, sequence_options.stop)
-        writer.append(odometry.finish())
         about = {'sequence': sequence.name, 'backbone': odometry.backbone.name,
                  'keyframe_policy': odometry.policy.name, 'scale_rule': odometry.scale.rule,
                  'seed': odometry_options.seed, 'version': __version__,
                  **odometry.backbone.condition()}
-        summary = writer.finish(about | ({'ended_early': problem} if problem else {}), truth)
+        with signals_collected():  # an impatient second Ctrl-C would cost the summary
+            writer.append(odometry.finish())
+            summary = writer.finish(about | ({'ended_early': problem} if problem else {}), truth)
     print(_describe(summary, writer.folder))
     if problem:
-        print(f'kfvo_run: error: {problem}; what was computed is in {writer.folder}',
-              file=sys.stderr)
-    return 1 if problem else 0
+        raise KfvoError(f'{problem}; what was computed is in {writer.folder}')
 
 
-def _parse(argv: list[str] | None) -> argparse.Namespace:
+def _parse(argv: list[str]) -> argparse.Namespace:
     from kfvo_ros.options import OdometryOptions, SequenceOptions, VggtOptions, add_arguments
-    parser = argparse.ArgumentParser(
-        prog='kfvo_run', description='Visual odometry over every frame of a sequence.',
-        epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser('kfvo_run', 'Visual odometry over every frame of a sequence.', EXAMPLES)
     parser.add_argument('sequence', help='dataset folder, bag, folder of images, video, or '
                         'synthetic:SEED[:smooth|fast|mixed]')
     parser.add_argument('--output', required=True, help='folder for trajectory.tum, '
                         'keyframes.tum and summary.json')
     parser.add_argument('--overwrite', action='store_true', help='replace earlier results')
-    parser.add_argument('--version', action='version', version=f'kfvo_ros {__version__}')
     add_arguments(parser, OdometryOptions)
     add_arguments(parser, VggtOptions)
     add_arguments(parser, SequenceOptions)

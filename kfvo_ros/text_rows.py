@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TypeVar
 
-from kfvo_ros.errors import KfvoError
+from kfvo_ros.errors import KfvoError, reason_of
 
 Row = TypeVar('Row')
 
@@ -23,7 +23,7 @@ def read_rows(path: Path, form: str, parse: Callable[[str], Row]) -> list[Row]:
     try:
         lines = path.read_text(encoding='utf-8').splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise KfvoError(f'cannot read {path}: {error}') from error
+        raise KfvoError(f'cannot read {path}: {reason_of(error)}') from error
     rows = []
     for number, line in enumerate(lines, 1):
         if not line.strip() or line.lstrip().startswith('#'):
@@ -41,4 +41,12 @@ def parse_floats(fields: Iterable[str], count: int) -> list[float]:
     numbers = [float(field) for field in fields]
     if len(numbers) != count or not all(map(math.isfinite, numbers)):
         raise ValueError(f'expected {count} finite numbers')
+    return numbers
+
+
+def parse_pose(fields: Iterable[str]) -> list[float]:
+    """Return a position and a quaternion in the order of `fields`; ValueError for no rotation."""
+    numbers = parse_floats(fields, 7)
+    if math.hypot(*numbers[3:]) < 1e-3:
+        raise ValueError('a quaternion of zeros')
     return numbers

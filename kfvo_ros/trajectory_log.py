@@ -13,7 +13,7 @@ from typing import TextIO
 
 import numpy as np
 
-from kfvo_ros.errors import KfvoError
+from kfvo_ros.errors import KfvoError, reason_of
 from kfvo_ros.trajectory import format_tum_line
 
 StampedPose = tuple[int, np.ndarray]
@@ -95,4 +95,4 @@ def _create(path: Path) -> TextIO:
 
 
 def _unwritable(path: Path, error: OSError) -> KfvoError:
-    return KfvoError(f'cannot write the trajectory {path}: {error.strerror}')
+    return KfvoError(f'cannot write the trajectory {path}: {reason_of(error)}')

@@ -25,6 +25,8 @@ from kfvo_ros.trajectory import Trajectory
 
 CAMERA = Camera(640, 480, 400.0, 400.0, 319.5, 239.5)
 RATE_NS = 50_000_000
+PATTERN = [True, False, False, True, False]
+"""Which frames a Scripted policy keeps, again and again."""
 
 
 class PointCloud:

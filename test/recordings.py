@@ -14,24 +14,18 @@ import yaml
 from bag_writers import COUNT, POSES, START_NS, BagWriter, images, truth_records
 from rosbags.highlevel import AnyReader
 from sequence_writers import (
+    DATASETS,
     HEIGHT,
     T_BODY_CAMERA,
     WIDTH,
     make_image,
     write_camera_info,
-    write_euroc,
     write_image,
-    write_kitti,
-    write_tartanair,
-    write_tum,
 )
 
 from kfvo_ros.convert import main
 from kfvo_ros.sequences import open_sequence
 from kfvo_ros.sequences.base import Sequence
-
-DATASETS = {'euroc': write_euroc, 'tum': write_tum, 'kitti': write_kitti,
-            'tartanair': write_tartanair}
 
 
 def write_bag(storage: str, root: Path, colour: bool) -> Path:

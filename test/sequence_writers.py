@@ -13,6 +13,8 @@ import numpy as np
 from kfvo_ros import geometry
 
 WIDTH, HEIGHT = 32, 24
+LENGTH = 4
+"""Frames of what `write_dataset` writes."""
 
 
 def make_image(index: int, colour: bool = False) -> np.ndarray:
@@ -125,3 +127,13 @@ def write_tartanair(root: Path, images: list[np.ndarray], poses: np.ndarray
     ned[:, :3, :3] = np.stack([poses[:, :3, 2], poses[:, :3, 0], poses[:, :3, 1]], axis=-1)
     write_text(folder / 'pose_left.txt', *(numbers(pose_numbers(pose)) for pose in ned))
     return folder, [100_000_000 * index for index in range(len(images))]
+
+
+DATASETS = {'euroc': write_euroc, 'tum': write_tum, 'kitti': write_kitti,
+            'tartanair': write_tartanair}
+
+
+def write_dataset(kind: str, root: Path, colour: bool = False) -> tuple[Path, list[int]]:
+    """Write LENGTH images and poses as one of DATASETS."""
+    images = [make_image(index, colour) for index in range(LENGTH)]
+    return DATASETS[kind](root, images, make_poses(LENGTH))

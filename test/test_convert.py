@@ -4,33 +4,19 @@
 
 from __future__ import annotations
 
-import os
 import signal
-import subprocess
-import sys
-import time
+from functools import partial
 from pathlib import Path
 
 import pytest
 from bag_writers import COUNT
+from command_lines import assert_one_readable_line, run_interrupted, run_python
 from recordings import assert_same, write_sequence
 
-import kfvo_ros
 from kfvo_ros.sequences import open_sequence
 from kfvo_ros.sequences.synthetic import SyntheticSequence
 
-ENVIRONMENT = os.environ | {'PYTHONPATH': str(Path(kfvo_ros.__file__).parents[1])}
-
-
-def command(*arguments: object) -> subprocess.CompletedProcess:
-    return subprocess.run([sys.executable, '-m', 'kfvo_ros.convert', *map(str, arguments)],
-                          capture_output=True, text=True, env=ENVIRONMENT, timeout=60)
-
-
-def assert_one_readable_line(done: subprocess.CompletedProcess, *parts: str) -> None:
-    assert done.returncode != 0 and 'Traceback' not in done.stderr + done.stdout
-    line, = (line for line in done.stderr.splitlines() if 'error:' in line)
-    assert all(part in line for part in parts), line
+command = partial(run_python, '-m', 'kfvo_ros.convert')
 
 
 @pytest.mark.parametrize('taken', ['folder', 'file', 'dead link'])
@@ -99,33 +85,22 @@ def test_a_full_disk(tmp_path):
     """A limit on the size of files stands in for it: writing fails in the same place."""
     script = ('import resource, sys; from kfvo_ros.convert import main; '
               'resource.setrlimit(resource.RLIMIT_FSIZE, (2 << 20, 2 << 20)); sys.exit(main())')
-    done = subprocess.run([sys.executable, '-c', script, 'synthetic:7', str(tmp_path / 'out'),
-                           '--stop', '20'], capture_output=True, text=True, env=ENVIRONMENT,
-                          timeout=60)
+    done = run_python('-c', script, 'synthetic:7', tmp_path / 'out', '--stop', 20)
     assert_one_readable_line(done, 'cannot write', str(tmp_path / 'out'), 'incomplete')
 
 
 @pytest.mark.parametrize('sent', [signal.SIGINT, signal.SIGTERM])
 def test_interruption_keeps_what_was_written(sent, tmp_path):
     bag = tmp_path / 'out'
-    process = subprocess.Popen([sys.executable, '-m', 'kfvo_ros.convert', 'synthetic:7', str(bag)],
-                               stderr=subprocess.PIPE, text=True, env=ENVIRONMENT)
-    try:
-        patience = time.monotonic() + 60.0
-        while not (bag.exists() and any(file.stat().st_size > 1 << 20 for file in bag.iterdir())):
-            assert time.monotonic() < patience
-            time.sleep(0.02)
-        process.send_signal(sent)
-        _, problems = process.communicate(timeout=30)
-    finally:
-        process.kill()
-    assert process.returncode == 1 and 'Traceback' not in problems
+    status, _, problems = run_interrupted(
+        sent, lambda: bag.exists() and any(file.stat().st_size > 1 << 20
+                                           for file in bag.iterdir()),
+        '-m', 'kfvo_ros.convert', 'synthetic:7', bag)
+    assert status == 1 and 'Traceback' not in problems
     copy = open_sequence(str(bag))
     assert f'interrupted; the {copy.length} images before' in problems.splitlines()[-1]
     assert 3 <= copy.length < 200
     assert_same(SyntheticSequence(7), copy, copy.length)
-
-
 
 
 def test_help():

@@ -1,27 +1,22 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The method on rendered images: windows, keyframes, finality, reproducibility, memory."""
+"""The method on rendered images: windows, keyframes, finality, reproducibility."""
 
 from __future__ import annotations
 
-import gc
 import itertools
-from types import ModuleType
 
 import numpy as np
 import pytest
-from odometry_scenes import RATE_NS, Run, Scripted, frames_of, restamped, run, truth_of
+from odometry_scenes import PATTERN, Run, Scripted, frames_of, run, truth_of
 
 from kfvo_ros import geometry, metrics
-from kfvo_ros.backbones.base import Backbone, Encoded
 from kfvo_ros.backbones.geometric.backbone import GeometricBackbone
-from kfvo_ros.backbones.geometric.observations import View
 from kfvo_ros.keyframes.heuristics import Every, OpticalFlow, Survival
 from kfvo_ros.odometry import WINDOW_SIZE, KeyframeOdometry
 from kfvo_ros.sequences.base import Frame
 
 COUNT = 60
-PATTERN = [True, False, False, True, False]
 
 
 @pytest.fixture(scope='module')
@@ -194,128 +189,6 @@ def test_update_tells_covariance_depth_and_durations(survival):
     depths = np.array([update.median_depth for update in survival.updates[1:]])
     assert (np.abs(np.log(depths)) < 1.5).all()  # the first window's median depth is 1
     assert survival.updates[0].median_depth is None
-
-
-class Forgetful(Backbone):
-    """A backbone without points, tracks or memory: it sees the world's pose in the stamp."""
-
-    name = 'forgetful'
-    descriptor_size = 1
-
-    def __init__(self, unit: float) -> None:
-        self.unit = unit
-        self.released: list[int] = []
-        self.opened = 0
-
-    def open(self, camera):
-        from kfvo_ros.backbones.base import Stream
-        backbone = self
-        self.opened += 1
-
-        class Plain(Stream):
-            def encode(self, frame):
-                return Encoded(frame.stamp_ns, np.ones(1, dtype=np.float32))
-
-            def release(self, encoded):
-                backbone.released.append(encoded.stamp_ns)
-        return Plain()
-
-    def estimate(self, windows):
-        from kfvo_ros.backbones.base import Estimate
-        result = []
-        for window in windows:
-            world = np.stack([self.pose(frame.stamp_ns) for frame in window.frames])
-            poses = geometry.relative(world[0], world)
-            poses[:, :3, 3] /= self.unit * (1.0 + 0.5 * np.sin(window.frames[0].stamp_ns))
-            poses[0] = np.eye(4)
-            result.append(Estimate(poses, np.zeros((len(poses), 6, 6)), None,
-                                   np.zeros(0, dtype=np.float32), memory='anything'))
-        return result
-
-    @staticmethod
-    def pose(stamp_ns: int) -> np.ndarray:
-        along = stamp_ns / RATE_NS - 1.0
-        return geometry.make_transform(geometry.exp_so3(np.array([0.0, 0.02, 0.01]) * along),
-                                       [along, np.sin(0.3 * along), 0.2 * along])
-
-
-def test_a_backbone_without_points_or_tracks(frames):
-    """VGGT's way: every window in a unit of its own, the tracker only for the policy."""
-    backbone = Forgetful(3.0)
-    given = restamped([frame.image for frame in frames[:40]], frames[0].camera)
-    result = run(given, Survival(), backbone)
-    truth = np.stack([Forgetful.pose(frame.stamp_ns) for frame in given])
-    fit = geometry.umeyama(result.poses[:, :3, 3], truth[:, :3, 3])
-    np.testing.assert_allclose(fit.transform_points(result.poses[:, :3, 3]), truth[:, :3, 3],
-                               atol=1e-6)
-    assert backbone.opened == 1
-    assert all(update.median_depth is None for update in result.updates)
-    # What left the window was released, once; what is still in it was not.
-    dropped = [update.stamp_ns for update in result.updates if not update.is_keyframe]
-    kept = [update.stamp_ns for update in result.updates if update.is_keyframe]
-    assert 0 < len(dropped) < 33
-    assert sorted(backbone.released) == sorted(dropped + kept[:-(WINDOW_SIZE - 1)])
-
-
-def test_scale_rule_none_trusts_the_window(frames):
-    given = restamped([frame.image for frame in frames[:20]], frames[0].camera)
-    trusting = run(given, Every(), Forgetful(3.0), scale_rule='none')
-    aligned = run(given, Every(), Forgetful(3.0))
-    truth = np.stack([Forgetful.pose(frame.stamp_ns) for frame in given])[:, :3, 3]
-
-    def misfit(result):
-        positions = result.poses[:, :3, 3]
-        fitted = geometry.umeyama(positions, truth).transform_points(positions)
-        return np.abs(fitted - truth).max()
-
-    assert misfit(aligned) < 1e-6 < 0.1 < misfit(trusting)
-
-
-def to_and_fro(frames: tuple[Frame, ...]) -> itertools.chain:
-    """Return the images there and back again, for ever."""
-    there = [frame.image for frame in frames]
-    return itertools.cycle(there + there[-2:0:-1])
-
-
-def bytes_held(root: object) -> int:
-    """Return the size of all arrays that can be reached from an object."""
-    seen, queue, total = {id(root)}, [root], 0
-    while queue:
-        thing = queue.pop()
-        total += thing.nbytes if isinstance(thing, np.ndarray) else 0
-        for referent in gc.get_referents(thing):
-            if id(referent) not in seen and not isinstance(referent, type | ModuleType):
-                seen.add(id(referent))
-                queue.append(referent)
-    return total
-
-
-def test_memory_does_not_grow_with_the_sequence():
-    frames = frames_of(2, 30, width=160, height=120)
-    policy = Scripted(*PATTERN * 60)
-    odometry = KeyframeOdometry(GeometricBackbone(), policy)
-    held, views, pending = [], [], []
-    for index, image in enumerate(itertools.islice(to_and_fro(frames), 300)):
-        odometry.process(Frame((index + 1) * RATE_NS, image, frames[0].camera))
-        policy.seen.clear()
-        if index % 20 == 19:
-            gc.collect()
-            held.append(bytes_held(odometry))
-            views.append(sum(isinstance(thing, View) for thing in gc.get_objects()))
-            pending.append(len(odometry.pending))
-    assert min(held) > 50_000  # the images and tracks of a window at least
-    assert max(held[5:]) <= 1.5 * max(held[:5])
-    assert max(views[5:]) <= max(views[:5]) + WINDOW_SIZE
-    assert max(pending) <= 3 * WINDOW_SIZE
-
-
-def test_pending_frames_are_bounded_while_keyframes_come(frames):
-    odometry = KeyframeOdometry(GeometricBackbone(), Scripted(*PATTERN * 12))
-    longest = 0
-    for frame in frames:
-        odometry.process(frame)
-        longest = max(longest, len(odometry.pending))
-    assert WINDOW_SIZE - 1 < longest <= 3 * WINDOW_SIZE
 
 
 def test_finish_hands_out_each_frame_once(frames):

@@ -17,6 +17,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
+from command_lines import assert_one_readable_line, run_python
 
 import kfvo_ros
 from kfvo_ros.camera import read_camera_info
@@ -36,7 +37,7 @@ BUILT = ('.git', '.venv*', '*.egg-info', '__pycache__', '.*_cache', 'build', 'in
 FLOORS = ((), ('sequences',), ('backbones',), ('keyframes',), ('knowledge', 'odometry', 'scale'),
           ('assembly', 'body', 'live', 'options', 'plots', 'recording', 'results'), ('ros',),
           ('rehearsal',),
-          ('commands', 'convert', 'demo', 'node', 'node_benchmark', 'play', 'run'))
+          ('convert', 'demo', 'node', 'node_benchmark', 'play', 'run'))
 HEAVY = ('rclpy', 'torch', 'scipy', 'stable_baselines3')
 MAY_BE_HEAVY = ('kfvo_ros.ros', 'kfvo_ros.learning', 'kfvo_ros.backbones.vggt')
 
@@ -63,13 +64,6 @@ def floor_of(module: str) -> int:
     return next((floor for floor, rooms in enumerate(FLOORS) if room in rooms), 0)
 
 
-def run_python(code: str, *arguments: str) -> subprocess.CompletedProcess[str]:
-    """Run code in a fresh interpreter that sees the package."""
-    environment = {**os.environ, 'PYTHONPATH': str(ROOT)}
-    return subprocess.run([sys.executable, '-c', code, *arguments], env=environment, text=True,
-                          capture_output=True, timeout=120, check=False)
-
-
 # Who imports whom
 
 
@@ -93,7 +87,7 @@ def test_core_imports_without_ros_torch_and_scipy() -> None:
     code = ('import importlib, sys\n'
             f'sys.modules.update(dict.fromkeys({HEAVY}))\n'
             'for name in sys.argv[1:]: importlib.import_module(name)')
-    outcome = run_python(code, *core)
+    outcome = run_python('-c', code, *core)
     assert outcome.returncode == 0, outcome.stderr
 
 
@@ -123,10 +117,8 @@ def test_run_names_a_missing_package(module: str, tmp_path: Path) -> None:
             f'sys.modules[{module!r}] = None\n'
             'from kfvo_ros.run import main\n'
             'sys.exit(main(["synthetic:0", "--stop", "2", "--output", sys.argv[1]]))')
-    outcome = run_python(code, str(tmp_path))
-    assert outcome.returncode == 1
-    assert f'{module} is missing: pip install {module}' in outcome.stderr
-    assert 'Traceback' not in outcome.stderr
+    outcome = run_python('-c', code, tmp_path)
+    assert_one_readable_line(outcome, f'{module} is missing: pip install {module}')
 
 
 # What colcon installs
@@ -240,7 +232,7 @@ def test_camera_of_the_euroc_bags() -> None:
 def test_ros_wheels_make_messages() -> None:
     if importlib.util.find_spec('rclpy') is None:
         pytest.skip("rclpy is not installed: source a ROS 2 or pip install '.[ros]'")
-    outcome = run_python('import rclpy\n'
+    outcome = run_python('-c', 'import rclpy\n'
                          'from nav_msgs.msg import Odometry, Path\n'
                          'from rclpy.serialization import deserialize_message, serialize_message\n'
                          'message = Odometry(child_frame_id="camera_body")\n'

@@ -5,17 +5,21 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import signal
 import subprocess
-import sys
-import time
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from command_lines import (
+    ENVIRONMENT,
+    assert_one_readable_line,
+    run_interrupted,
+    run_python,
+)
 from odometry_scenes import frames_of
 from sequence_writers import write_camera_info
 
@@ -24,23 +28,9 @@ from kfvo_ros.sequences import open_sequence
 from kfvo_ros.trajectory import format_stamp, read_tum
 
 COUNT = 24
-ENVIRONMENT = os.environ | {'PYTHONPATH': str(Path(kfvo_ros.__file__).parents[1])}
 POSE = re.compile(r'\d+\.\d{9}( -?\d+\.\d{9}){7}')
 
-
-def command(*arguments: object, **options) -> subprocess.CompletedProcess:
-    return subprocess.run([sys.executable, '-m', 'kfvo_ros.run', *map(str, arguments)],
-                          capture_output=True, text=True, env=ENVIRONMENT, timeout=120, **options)
-
-
-def assert_one_readable_line(done: subprocess.CompletedProcess, *parts: str) -> None:
-    """Assert that it failed and that stderr ends in one line that says why."""
-    assert done.returncode != 0
-    assert 'Traceback' not in done.stderr + done.stdout
-    lines = [line for line in done.stderr.splitlines() if 'error:' in line]
-    assert len(lines) == 1, done.stderr
-    for part in parts:
-        assert part in lines[0]
+command = partial(run_python, '-m', 'kfvo_ros.run')
 
 
 @pytest.fixture(scope='module')
@@ -140,20 +130,11 @@ def test_ground_truth_and_options(tmp_path):
 
 @pytest.mark.parametrize('sent', [signal.SIGINT, signal.SIGTERM])
 def test_interruption_keeps_what_was_computed(sent, tmp_path):
-    process = subprocess.Popen(
-        [sys.executable, '-m', 'kfvo_ros.run', 'synthetic:1:fast', '--output', str(tmp_path),
-         '--keyframes', 'every'], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        env=ENVIRONMENT)
-    try:
-        trajectory, patience = tmp_path / 'trajectory.tum', time.monotonic() + 60.0
-        while not (trajectory.exists() and trajectory.read_text().count('\n') >= 3):
-            assert time.monotonic() < patience
-            time.sleep(0.05)
-        process.send_signal(sent)
-        _, problems = process.communicate(timeout=30)
-    finally:
-        process.kill()
-    assert process.returncode == 1
+    trajectory = tmp_path / 'trajectory.tum'
+    status, _, problems = run_interrupted(
+        sent, lambda: trajectory.exists() and trajectory.read_text().count('\n') >= 3,
+        '-m', 'kfvo_ros.run', 'synthetic:1:fast', '--output', tmp_path, '--keyframes', 'every')
+    assert status == 1
     assert 'Traceback' not in problems
     assert 'interrupted' in problems.splitlines()[-1]
     summary = json.loads((tmp_path / 'summary.json').read_text())
@@ -207,6 +188,14 @@ def test_output_that_cannot_be_written(images, tmp_path):
     assert_one_readable_line(command(images, '--output', tmp_path / 'file' / 'out'), 'file')
 
 
+def test_a_full_disk(images, tmp_path):
+    """In the developers' mode Python tells of errors at its exit too."""
+    (tmp_path / 'trajectory.tum').symlink_to('/dev/full')
+    done = command(images, '--output', tmp_path, '--overwrite',
+                   env=ENVIRONMENT | {'PYTHONDEVMODE': '1'})
+    assert_one_readable_line(done, f'cannot write to {tmp_path}', 'No space left on device')
+
+
 def test_wrong_rate(images, tmp_path):
     assert_one_readable_line(command(images, '--output', tmp_path / 'out', '--rate', 'inf'),
                              'inf')
@@ -215,9 +204,7 @@ def test_wrong_rate(images, tmp_path):
 def test_runs_without_torch_and_rclpy(images, tmp_path):
     script = ("import sys; sys.modules['torch'] = sys.modules['rclpy'] = None; "
               'from kfvo_ros.run import main; sys.exit(main())')
-    done = subprocess.run([sys.executable, '-c', script, str(images), '--output', str(tmp_path),
-                           '--stop', '10'], capture_output=True, text=True, env=ENVIRONMENT,
-                          timeout=60)
+    done = run_python('-c', script, images, '--output', tmp_path, '--stop', 10)
     assert done.returncode == 0, done.stderr
     assert json.loads((tmp_path / 'summary.json').read_text())['frames'] == 10
 

@@ -29,7 +29,7 @@ from rosbags.rosbag2 import (
 )
 from rosbags.typesys import Stores, get_typestore
 
-from kfvo_ros.errors import KfvoError
+from kfvo_ros.errors import KfvoError, reason_of
 from kfvo_ros.sequences.bag_reader import BAG_SUFFIXES
 
 FOREVER = QosTime(9223372036, 854775807)
@@ -111,8 +111,7 @@ class BagWriter:
         except (OSError, WriterError) as error:
             with suppress(OSError):
                 self._writer.abort()
-            reason = (isinstance(error, OSError) and error.strerror) or str(error)
             torn = '; what is there is incomplete: delete it, or rescue what "mcap recover" can'
-            self._failure = KfvoError(f'cannot write {self.path}: {reason}'
+            self._failure = KfvoError(f'cannot write {self.path}: {reason_of(error)}'
                                       f'{torn if self._connections else ""}')
             raise self._failure from error

@@ -14,19 +14,16 @@ from kfvo_ros import geometry
 from kfvo_ros.camera import Camera
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.sequences.base import FixedTransform
-from kfvo_ros.trajectory import NANOSECONDS, format_stamp
+from kfvo_ros.trajectory import NANOSECONDS, UNKNOWN_VARIANCE, format_stamp
 
 END_NS = 2 ** 31 * NANOSECONDS
 """The seconds of a ROS stamp have 31 bits: they end in 2038."""
-
-UNKNOWN_VARIANCE = 9999.0
-"""Variance of a velocity that nobody measured, as rtabmap has it; zero would mean exact."""
 
 
 def header_of(stamp_ns: int, frame_id: str) -> ros.std_msgs__msg__Header:
     """Return a std_msgs/Header; raises KfvoError for a time that ROS cannot express."""
     if not 0 <= stamp_ns < END_NS:
-        raise KfvoError(f'expected a time of 1970 to 2038, the only ones of ROS; came '
+        raise KfvoError('expected a time of 1970 to 2038, the only ones of ROS; came '
                         f'{format_stamp(stamp_ns)} s')
     seconds, nanoseconds = divmod(int(stamp_ns), NANOSECONDS)
     stamp = ros.builtin_interfaces__msg__Time(sec=seconds, nanosec=nanoseconds)

@@ -20,7 +20,7 @@ from kfvo_ros.ros.messages import make_odometry, make_path, make_pose, make_tran
 from kfvo_ros.ros.parameters import NodeOptions
 
 QUIET_S = 5.0
-"""What keeps every pose back is logged once in so many seconds."""
+"""What is wrong with every image, or keeps every pose back, is logged once in so many seconds."""
 
 
 class Outputs:

@@ -6,15 +6,13 @@ from __future__ import annotations
 
 import difflib
 from dataclasses import Field, dataclass, fields
-from typing import Any, TypeVar
+from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
 
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.options import option, type_of
-
-Options = TypeVar('Options')
 
 ROS_OWN = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')
 """Beginnings of the names that rclpy declares itself."""
@@ -93,7 +91,7 @@ def _read(node: Node, kind: type[Any], declared: Field[Any]) -> Any:
     if node.has_parameter(declared.name):
         value = _checked(declared, expected, node.get_parameter(declared.name).value)
         node.undeclare_parameter(declared.name)
-    node.declare_parameter(declared.name, value, _describe(declared, expected),
+    node.declare_parameter(declared.name, value, _descriptor(declared, expected),
                            ignore_override=True)
     return None if declared.default is None and value == '' else value
 
@@ -118,7 +116,7 @@ def _checked(declared: Field[Any], expected: type, value: Any) -> Any:
     return value
 
 
-def _describe(declared: Field[Any], expected: type) -> ParameterDescriptor:
+def _descriptor(declared: Field[Any], expected: type) -> ParameterDescriptor:
     meta = declared.metadata
     descriptor = ParameterDescriptor(description=meta['description'], read_only=True)
     if meta['choices']:

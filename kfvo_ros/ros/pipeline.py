@@ -22,14 +22,12 @@ from kfvo_ros.options import OdometryOptions
 from kfvo_ros.ros.camera_source import CameraSource
 from kfvo_ros.ros.messages import to_array, to_stamp_ns
 from kfvo_ros.ros.monitor import Monitor
-from kfvo_ros.ros.outputs import Outputs
+from kfvo_ros.ros.outputs import QUIET_S, Outputs
 from kfvo_ros.ros.parameters import NodeOptions
 from kfvo_ros.sequences.base import Frame
 from kfvo_ros.trajectory import NANOSECONDS
 from kfvo_ros.trajectory_log import TrajectoryLog, free_path
 
-QUIET_S = 5.0
-"""What goes wrong with every image is logged once in so many seconds."""
 CALIBRATION_WAIT_S = 0.5
 """An image waits so long for the CameraInfo that was sent with it."""
 DEFAULT_FILE = 'kfvo_trajectory.tum'

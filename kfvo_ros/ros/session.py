@@ -18,7 +18,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
-from kfvo_ros.errors import KfvoError
+from kfvo_ros.errors import KfvoError, reason_of
 
 AnyNode = TypeVar('AnyNode', bound=Node)
 
@@ -73,5 +73,4 @@ def _told() -> Iterator[None]:
     try:
         yield
     except RuntimeError as error:  # the base of rclpy's own errors
-        reason = ' '.join(str(error).split())
-        raise KfvoError(f'these ROS arguments do not work: {reason}') from error
+        raise KfvoError(f'these ROS arguments do not work: {reason_of(error)}') from error

@@ -12,7 +12,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from kfvo_ros.errors import KfvoError
+from kfvo_ros.errors import KfvoError, reason_of
 from kfvo_ros.trajectory import NANOSECONDS
 
 BAG_SUFFIXES = frozenset(('.bag', '.mcap', '.db3'))
@@ -112,6 +112,12 @@ class Bag:
             for connection, bag_time_ns, raw in self._reader.messages(connections):
                 yield bag_time_ns, self._reader.deserialize(raw, connection.msgtype)
 
+    def first(self, topic: str) -> Any:
+        """Return the first message of a topic that holds some."""
+        for _, message in self.messages(topic):
+            return message
+        raise KfvoError(f'{self.path}: the index promises messages on {topic}, there are none')
+
     def raw_messages(self, topics: Collection[str], start_ns: int,
                      stop_ns: int) -> Iterator[tuple[str, int, bytes]]:
         """Yield (topic, bag time [ns], CDR) from `start_ns` to before `stop_ns`, by bag time.
@@ -160,12 +166,6 @@ class Bag:
         types = get_typestore(Stores.EMPTY)
         types.register(recorded.fielddefs | {HEADER: header})
         return types
-
-    def first(self, topic: str) -> Any:
-        """Return the first message of a topic that holds some."""
-        for _, message in self.messages(topic):
-            return message
-        raise KfvoError(f'{self.path}: the index promises messages on {topic}, there are none')
 
 
 def stamp_of(header: Any, bag_time_ns: int) -> int:
@@ -220,6 +220,6 @@ def _told(path: Path) -> Iterator[None]:
     except KfvoError:
         raise
     except Exception as error:
-        reason = ' '.join(str(error).split()) or type(error).__name__
-        raise KfvoError(f'cannot read the bag {path}: {reason}; is it complete? Recover it with '
-                        '"ros2 bag reindex", "mcap recover" or "rosbag reindex"') from error
+        raise KfvoError(f'cannot read the bag {path}: {reason_of(error)}; is it complete? '
+                        'Recover it with "ros2 bag reindex", "mcap recover" or "rosbag reindex"'
+                        ) from error

@@ -16,12 +16,12 @@ import yaml
 
 from kfvo_ros import geometry
 from kfvo_ros.camera import Camera
-from kfvo_ros.errors import KfvoError
+from kfvo_ros.errors import KfvoError, reason_of
 from kfvo_ros.sequences.base import GroundTruth
 from kfvo_ros.sequences.calibration import Calibration, rigid_transform
 from kfvo_ros.sequences.image_list import ImageListSequence
 from kfvo_ros.sequences.kind import Kind, Options
-from kfvo_ros.text_rows import parse_floats, read_rows
+from kfvo_ros.text_rows import parse_pose, read_rows
 from kfvo_ros.trajectory import Trajectory
 
 
@@ -55,8 +55,7 @@ def _read_sensor(path: Path) -> dict[str, Any]:
         lines = path.read_text(encoding='utf-8').splitlines()
         sensor = yaml.safe_load('\n'.join(line for line in lines if not line.startswith('%')))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        reason = ' '.join(str(error).split())
-        raise KfvoError(f'cannot read {path}: {reason}') from error
+        raise KfvoError(f'cannot read {path}: {reason_of(error)}') from error
     if not isinstance(sensor, dict):
         raise KfvoError(f'{path}: expected the keys of an EuRoC sensor, found {sensor!r:.80}')
     return sensor
@@ -104,7 +103,4 @@ def _read_extrinsics(sensor_file: Path) -> np.ndarray | None:
 
 def _parse_pose(line: str) -> tuple[int, list[float]]:
     stamp_ns, *fields = line.split(',')
-    values = parse_floats(fields[:7], 7)
-    if not any(values[3:]):
-        raise ValueError('a quaternion of zeros')
-    return int(stamp_ns), values
+    return int(stamp_ns), parse_pose(fields[:7])

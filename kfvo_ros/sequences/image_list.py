@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from kfvo_ros.camera import Camera
-from kfvo_ros.errors import KfvoError
+from kfvo_ros.errors import KfvoError, reason_of
 from kfvo_ros.images import read_image
 from kfvo_ros.sequences.base import BODY_FRAME, FixedTransform, Frame, GroundTruth, Sequence
 from kfvo_ros.sequences.calibration import Calibration
@@ -82,7 +82,7 @@ def list_images(folder: Path) -> list[str]:
         names = [path.name for path in folder.iterdir()
                  if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith('.')]
     except OSError as error:
-        raise KfvoError(f'cannot list the folder {folder}: {error.strerror}') from error
+        raise KfvoError(f'cannot list the folder {folder}: {reason_of(error)}') from error
     return sorted(names, key=_natural_order)
 
 

@@ -114,7 +114,7 @@ def parse_synthetic(text: str) -> SyntheticSequence:
     """Return the sequence of ``synthetic:SEED[:STYLE]``; raises KfvoError for anything else."""
     match = re.fullmatch(r'synthetic:([0-9]{1,10})(?::([a-z]+))?', text)
     if match is None:
-        raise KfvoError(f'expected synthetic:SEED or synthetic:SEED:STYLE, as in '
+        raise KfvoError('expected synthetic:SEED or synthetic:SEED:STYLE, as in '
                         f'synthetic:7:fast, came {text!r}')
     return SyntheticSequence(int(match[1]), match[2] or 'mixed')
 

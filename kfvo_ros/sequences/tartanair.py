@@ -20,7 +20,7 @@ from kfvo_ros.sequences.base import GroundTruth
 from kfvo_ros.sequences.calibration import Calibration
 from kfvo_ros.sequences.image_list import ImageListSequence, list_images, stamps_at_rate
 from kfvo_ros.sequences.kind import Kind, Options
-from kfvo_ros.text_rows import parse_floats, read_rows
+from kfvo_ros.text_rows import parse_pose, read_rows
 from kfvo_ros.trajectory import Trajectory
 
 CAMERA = Camera(640, 480, 320.0, 320.0, 320.0, 240.0)
@@ -53,17 +53,10 @@ def _read_ground_truth(path: Path, stamps_ns: np.ndarray) -> GroundTruth | None:
     """Read poses of the NED camera and turn them to optical axes; the world stays NED."""
     if not path.is_file():
         return None
-    rows = read_rows(path, 'tx ty tz qx qy qz qw', _parse_pose)
+    rows = read_rows(path, 'tx ty tz qx qy qz qw', lambda line: parse_pose(line.split()))
     if len(rows) != len(stamps_ns):
         raise KfvoError(f'{path} holds {len(rows)} poses for {len(stamps_ns)} images; '
                         'expected one line per image')
     values = np.array(rows).reshape(-1, 7)
     rotations = geometry.rotation_from_quat_xyzw(values[:, 3:]) @ R_NED_OPTICAL
     return GroundTruth(Trajectory(stamps_ns, geometry.make_transform(rotations, values[:, :3])))
-
-
-def _parse_pose(line: str) -> list[float]:
-    values = parse_floats(line.split(), 7)
-    if not any(values[3:]):
-        raise ValueError('a quaternion of zeros')
-    return values

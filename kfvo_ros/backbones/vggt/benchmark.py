@@ -24,7 +24,7 @@ from kfvo_ros.backbones.vggt.config import PATCH, VggtConfig
 from kfvo_ros.backbones.vggt.out_of_memory import memory_bounded
 from kfvo_ros.backbones.vggt.precision import PRECISIONS, choose_device, choose_dtype
 from kfvo_ros.backbones.vggt.rehearsal import STEPS, Scene, count_flops, random_model
-from kfvo_ros.errors import KfvoError
+from kfvo_ros.commands import make_parser, run_command
 from kfvo_ros.memory_use import peak_rss_mb
 
 Times = dict[str, list[float]]
@@ -32,20 +32,11 @@ Times = dict[str, list[float]]
 
 def main(argv: list[str] | None = None) -> int:
     """Run the benchmark; return its exit status."""
-    arguments = _parse(argv)
-    try:
-        device = choose_device(arguments.device)
-        with torch.inference_mode(), memory_bounded(device):
-            _run(arguments, device)
-    except KfvoError as error:
-        print(f'vggt benchmark: error: {error}', file=sys.stderr)
-        return 1
-    return 0
+    return run_command('kfvo_ros.backbones.vggt.benchmark', _run, argv)
 
 
-def _parse(argv: list[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog='python -m kfvo_ros.backbones.vggt.benchmark',
-                                     description=__doc__)
+def _parse(argv: list[str]) -> argparse.Namespace:
+    parser = make_parser('python -m kfvo_ros.backbones.vggt.benchmark', __doc__ or '')
     parser.add_argument('--size', type=_size, default=(392, 518), metavar='HxW',
                         help='size of the images, multiples of 14 (default: 392x518)')
     parser.add_argument('--frames', type=int, default=8, help='frames of a window '
@@ -71,7 +62,14 @@ def _size(text: str) -> tuple[int, int]:
     return size
 
 
-def _run(arguments: argparse.Namespace, device: torch.device) -> None:
+def _run(argv: list[str]) -> None:
+    arguments = _parse(argv)
+    device = choose_device(arguments.device)
+    with torch.inference_mode(), memory_bounded(device):
+        _compare(arguments, device)
+
+
+def _compare(arguments: argparse.Namespace, device: torch.device) -> None:
     """Time the steps and print the table."""
     dtype = choose_dtype(arguments.precision, device)
     shape: tuple[int, int, int] = (*arguments.size, arguments.frames)

@@ -15,7 +15,7 @@ from torch import Tensor
 from kfvo_ros.backbones.vggt.config import config_of
 from kfvo_ros.backbones.vggt.model import Vggt
 from kfvo_ros.backbones.vggt.precision import set_precision
-from kfvo_ros.errors import KfvoError
+from kfvo_ros.errors import KfvoError, reason_of
 
 PARTS = ('aggregator.', 'camera_head.')
 """What is built; the heads for depth, points and tracks of a full checkpoint are skipped."""
@@ -58,9 +58,8 @@ def _map(path: Path) -> dict[str, Tensor]:
             return load_file(path)
         state = torch.load(path, map_location='cpu', weights_only=True, mmap=True)
     except (OSError, SafetensorError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
-        reason = str(error).strip().splitlines()[0] if str(error).strip() else 'it is empty'
         raise KfvoError(f'cannot read the weights in {path}; expected a whole .safetensors file, '
-                        f'or a .pt file of nothing but tensors: {reason}') from error
+                        f'or a .pt file of nothing but tensors: {reason_of(error)}') from error
     if not isinstance(state, dict) or not all(isinstance(each, Tensor) for each in state.values()):
         raise KfvoError(f'{path}: expected tensors by name, as state_dict() gives them')
     return state

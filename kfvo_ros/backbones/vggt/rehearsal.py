@@ -85,7 +85,7 @@ def random_model(device: torch.device, dtype: torch.dtype,
 def count_flops(step: Callable[[Scene], Tensor], height: int, width: int, frames: int) -> int:
     """Return the floating point operations of a step of the full model; nothing is computed."""
     with torch.device('meta'):
-        scene = Scene(Vggt(), height, width, frames)
+        scene = Scene(Vggt().requires_grad_(False), height, width, frames)
         scene.keep_anchor()
         with FlopCounterMode(display=False) as counter:
             step(scene)

@@ -15,7 +15,7 @@ from huggingface_hub.errors import (
     LocalEntryNotFoundError,
 )
 
-from kfvo_ros.errors import KfvoError
+from kfvo_ros.errors import KfvoError, reason_of
 
 FILES = {'facebook/VGGT-1B-Commercial': 'vggt_1B_commercial.pt'}
 DEFAULT_FILE = 'model.safetensors'
@@ -58,6 +58,5 @@ def _download(repository: str, revision: str | None) -> Path:
             f'connect it to the network once, or copy {file} from {page} here and set weights to '
             'its path, or use the geometric backbone, which needs none') from error
     except (EntryNotFoundError, HfHubHTTPError, OSError) as error:
-        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
-        raise KfvoError(f'cannot download {file} of {repository} (revision {revision}): {reason}; '
-                        f'see {page}') from error
+        raise KfvoError(f'cannot download {file} of {repository} (revision {revision}); see '
+                        f'{page}: {reason_of(error)}') from error

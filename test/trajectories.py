@@ -1,0 +1,67 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Trajectories to measure: by hand, at random, disturbed, and those of the data folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from kfvo_ros import geometry
+from kfvo_ros.geometry import Similarity
+from kfvo_ros.trajectory import Trajectory, parse_stamp_ns, read_tum
+
+EPOCH_NS = 1_403_715_273_262_142_976
+MILLISECOND = 1_000_000
+
+
+def trajectory(positions, step_ms: int = 100, rotation_vectors=None) -> Trajectory:
+    """Return poses at regular stamps, not turning unless told."""
+    positions = np.asarray(positions, dtype=np.float64)
+    turns = np.zeros_like(positions) if rotation_vectors is None else rotation_vectors
+    stamps_ns = EPOCH_NS + np.arange(len(positions)) * step_ms * MILLISECOND
+    return Trajectory(stamps_ns, geometry.make_transform(geometry.exp_so3(turns), positions))
+
+
+def along_x(*x: float) -> Trajectory:
+    """Return positions on a line."""
+    return trajectory([[value, 0.0, 0.0] for value in x])
+
+
+def wandering(seed: int, count: int = 150) -> Trajectory:
+    """Return a random walk in position and rotation that pauses twice."""
+    rng = np.random.default_rng(seed)
+    steps = geometry.make_transform(geometry.exp_so3(rng.normal(0, 0.1, (count, 3))),
+                                    rng.normal(0.2, 0.3, (count, 3)))
+    steps[30:40] = steps[100:103] = np.eye(4)
+    poses = [np.eye(4)]
+    for step in steps[1:]:
+        poses.append(poses[-1] @ step)
+    return Trajectory(EPOCH_NS + np.cumsum(rng.integers(30, 70, count)) * MILLISECOND,
+                      np.array(poses))
+
+
+def disturbed(truth: Trajectory, seed: int, trans: float = 0.05, rot: float = 0.02) -> Trajectory:
+    """Return the truth with drift, noise and a world and scale of its own."""
+    rng = np.random.default_rng(seed)
+    count = len(truth)
+    drift = np.cumsum(rng.normal(0, trans, (count, 3)), axis=0) / 3
+    noise = geometry.make_transform(geometry.exp_so3(rng.normal(0, rot, (count, 3))),
+                                    rng.normal(0, trans, (count, 3)) + drift)
+    world = Similarity(0.3, geometry.exp_so3([0.5, -1.0, 2.0]), np.array([7.0, 8.0, 9.0]))
+    return Trajectory(truth.stamps_ns, world.transform_poses(truth.poses @ noise))
+
+
+def stamps_of(path: Path) -> np.ndarray:
+    """Return the stamps (N,) [ns] in the first column of a file."""
+    lines = path.read_text().splitlines()
+    return np.array([parse_stamp_ns(line.split()[0]) for line in lines
+                     if not line.startswith('#')])
+
+
+def freiburg1_rpy(data_path: Callable[[str], Path]) -> tuple[np.ndarray, Trajectory]:
+    """Return the stamps of the frames and the ground truth, or skip the test."""
+    folder = data_path('tum/rgbd_dataset_freiburg1_rpy')
+    return stamps_of(folder / 'rgb.txt'), read_tum(folder / 'groundtruth.txt')
