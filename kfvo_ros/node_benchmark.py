@@ -55,7 +55,7 @@ def _compare(bag: Path, count: int) -> None:
     print()
     for name, offline, heard, rate in (('20 Hz', paced, usual, RATE_HZ),
                                        ('twice capacity', hurried, flooded, twice_hz)):
-        print(_line(name, offline, heard, rate))
+        print(_line(name, count, offline, heard, rate))
 
 
 def _time_offline(bag: Path, period_s: float) -> np.ndarray:
@@ -78,15 +78,15 @@ def _time_offline(bag: Path, period_s: float) -> np.ndarray:
     return np.array(durations)
 
 
-def _line(name: str, offline: np.ndarray, heard: Heard, rate: float) -> str:
+def _line(name: str, sent: int, offline: np.ndarray, heard: Heard, rate: float) -> str:
     """Return what came of one stream; every image must be accounted for."""
-    unaccounted = heard.received - heard.dropped - len(heard.stamps_ns)
+    unaccounted = sent - heard.missed - heard.dropped - len(heard.stamps_ns)
     median = float(np.median(offline))
-    return (f'{name} ({rate:.1f} Hz): {heard.received} images, {heard.dropped} dropped, '
-            f'{len(heard.stamps_ns)} poses, {unaccounted} unaccounted for; latency '
-            f'{heard.latency_median_ms:.1f} ms (95 %: {heard.latency_p95_ms:.1f}), offline '
-            f'{median:.1f} ms (95 %: {np.percentile(offline, 95):.1f}): '
-            f'{heard.latency_median_ms - median:+.1f} ms')
+    return (f'{name} ({rate:.1f} Hz): {sent} images, {heard.missed} lost in transit, '
+            f'{heard.received} received, {heard.dropped} dropped, {len(heard.stamps_ns)} poses, '
+            f'{unaccounted} unaccounted for; latency {heard.latency_median_ms:.1f} ms (95 %: '
+            f'{heard.latency_p95_ms:.1f}), offline {median:.1f} ms (95 %: '
+            f'{np.percentile(offline, 95):.1f}): {heard.latency_median_ms - median:+.1f} ms')
 
 
 if __name__ == '__main__':

@@ -7,11 +7,16 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.interruption import signals_held
+
+if TYPE_CHECKING:
+    from kfvo_ros.ros.witness import Witness
 
 SETTLED_S, PATIENCE_S = 1.5, 60.0
 """Without a new pose for so long the node has caught up; it is waited for so long at most."""
@@ -20,10 +25,14 @@ STOP_S = 5.0
 
 @dataclass(frozen=True)
 class Heard:
-    """What a node said from its start to its end; latencies from an image's arrival [ms]."""
+    """What a node said from its start to its end; latencies from an image's arrival [ms].
+
+    Of its images, `missed` were lost before it, and `dropped` of the `received` by itself.
+    """
 
     stamps_ns: list[int]
     keyframes_ns: list[int]
+    missed: int
     received: int
     dropped: int
     latency_median_ms: float
@@ -46,6 +55,7 @@ def rehearse(bag: Path, topic: str, parameters: dict[str, object], rate: float =
     with spinning(Witness, []) as witness, subprocess.Popen(
             [sys.executable, '-m', 'kfvo_ros.node', '--ros-args', *given]) as node:
         try:
+            _await_node(witness, node)
             player = subprocess.run(
                 [sys.executable, '-m', 'kfvo_ros.play', str(bag), '--rate', str(rate), '--topic',
                  topic, '--topic', f'{topic.rpartition("/")[0]}/camera_info',
@@ -61,6 +71,17 @@ def rehearse(bag: Path, topic: str, parameters: dict[str, object], rate: float =
     if player.returncode != 0 or node.returncode != 0 or 'images received' not in values:
         raise KfvoError(f'kfvo_play ended with status {player.returncode} and kfvo_node with '
                         f'{node.returncode}; expected 0 of both and diagnostics')
-    return Heard(witness.stamps_ns, witness.keyframes_ns, int(values['images received']),
-                 int(values['images dropped']), float(values['latency median [ms]']),
-                 float(values['latency 95 % [ms]']))
+    missed, received, dropped = (int(values[f'images {what}'])
+                                 for what in ('lost in transit', 'received', 'dropped'))
+    return Heard(witness.stamps_ns, witness.keyframes_ns, missed, received, dropped,
+                 float(values['latency median [ms]']), float(values['latency 95 % [ms]']))
+
+
+
+def _await_node(witness: Witness, node: subprocess.Popen[bytes]) -> None:
+    """Return when the witness hears the node, so that it misses no pose; raises KfvoError."""
+    end = time.monotonic() + PATIENCE_S
+    while not witness.values:
+        if node.poll() is not None or time.monotonic() > end:
+            raise KfvoError('kfvo_node does not run; what it says is above')
+        time.sleep(0.05)

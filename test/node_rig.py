@@ -24,8 +24,10 @@ from kfvo_ros.sequences.base import Frame
 from kfvo_ros.sequences.synthetic import SyntheticSequence
 from kfvo_ros.trajectory import NANOSECONDS
 
+builtin_interfaces = pytest.importorskip('builtin_interfaces.msg')
 diagnostic_msgs = pytest.importorskip('diagnostic_msgs.msg')
 nav_msgs = pytest.importorskip('nav_msgs.msg')
+rosgraph_msgs = pytest.importorskip('rosgraph_msgs.msg')
 sensor_msgs = pytest.importorskip('sensor_msgs.msg')
 std_srvs = pytest.importorskip('std_srvs.srv')
 from rclpy.qos import QoSProfile, ReliabilityPolicy  # noqa: E402
@@ -34,6 +36,7 @@ NODE = 'kfvo_ros.node'
 IMAGE, INFO = '/camera/image_raw', '/camera/camera_info'
 ODOMETRY, PATH, DIAGNOSTICS = '/kfvo/odometry', '/kfvo/path', '/diagnostics'
 WIDTH, HEIGHT, COUNT = 320, 240, 40
+WARN = 1
 RELIABLE = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 BEST_EFFORT = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
 
@@ -75,6 +78,11 @@ def to_pose(pose: Any) -> np.ndarray:
     """Return (4, 4) of a geometry_msgs/Pose."""
     p, q = pose.position, pose.orientation
     return geometry.transform_from_xyz_quat(np.array([p.x, p.y, p.z, q.x, q.y, q.z, q.w]))
+
+
+def is_origin(message: Any) -> bool:
+    """Return whether an Odometry is where odom is."""
+    return bool(np.allclose(to_pose(message.pose.pose), np.eye(4), atol=1e-12))
 
 
 class Rig:
@@ -141,6 +149,18 @@ class Rig:
             if with_info:
                 self.info.publish(to_info(frame.camera, frame.stamp_ns))
             self.image.publish(to_image(frame.stamp_ns, frame.image))
+
+    def send_until_heard(self, frames: Sequence[Frame]) -> None:
+        """Send frames over and over, each later than the one before, until a pose comes.
+
+        The node may know the camera later than the camera knows the node.
+        """
+        for index in range(100):
+            frame = frames[index % len(frames)]
+            self.send([Frame(frame.stamp_ns + index * NANOSECONDS, frame.image, frame.camera)])
+            if self.odometry():
+                return
+            time.sleep(0.05)
 
     def drive(self, frames: Sequence[Frame]) -> list[Any]:
         """Send frames and return their Odometry messages."""

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import ast
+import json
 import os
 from dataclasses import fields
 from pathlib import Path
@@ -76,3 +77,16 @@ def test_rviz_shows_what_the_node_publishes() -> None:
     displays = yaml.safe_load(text)['Visualization Manager']['Displays']
     topics = {display['Topic']['Value'] for display in displays if 'Topic' in display}
     assert topics == {'/kfvo/odometry', '/kfvo/path'}
+
+
+def test_foxglove_layout_has_a_place_for_every_panel() -> None:
+    """Which topics they show, test_node compares with what the node publishes."""
+    layout = json.loads((ROOT / 'foxglove' / 'kfvo.json').read_text())
+
+    def places(part: str | dict) -> list[str]:
+        return [part] if isinstance(part, str) else [*places(part['first']),
+                                                     *places(part['second'])]
+
+    assert sorted(places(layout['layout'])) == sorted(layout['configById'])
+    scene = layout['configById']['3D!kfvo']
+    assert (scene['followTf'], scene['layers']['grid']['frameId']) == ('odom', 'odom')

@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 from ros_processes import run_module
 
+from kfvo_ros.errors import KfvoError
+from kfvo_ros.rehearsal import rehearse
 from kfvo_ros.trajectory import read_tum
 
 pytest.importorskip('matplotlib', reason="matplotlib is not installed: pip install '.[demo]'")
@@ -46,6 +48,11 @@ def test_demo_wants_ground_truth(tmp_path: Path) -> None:
     assert outcome.returncode == 1
     assert 'has no ground truth to compare with' in outcome.stderr
     assert 'Traceback' not in outcome.stderr
+
+
+def test_a_node_that_does_not_start_is_not_waited_for(tmp_path: Path) -> None:
+    with pytest.raises(KfvoError, match='kfvo_node does not run'):
+        rehearse(tmp_path / 'bag', '/image', {'window_size': 2})
 
 
 def test_node_benchmark_accounts_for_every_image() -> None:

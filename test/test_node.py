@@ -4,15 +4,19 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import time
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from node_rig import (
     COUNT,
+    DIAGNOSTICS,
     NODE,
+    ODOMETRY,
     PATH,
     Rig,
     make_frames,
@@ -30,6 +34,7 @@ from kfvo_ros.trajectory import NANOSECONDS, read_tum
 from kfvo_ros.trajectory_log import TrajectoryLog
 
 PATH_LENGTH = 15
+MOUNTING = (0.4, -0.2, 1.1, 0.5, -0.1, 0.7, 0.5)
 STAMPS_NS = [frame.stamp_ns for frame in make_frames()]
 
 
@@ -42,9 +47,10 @@ def drive(tmp_path_factory) -> SimpleNamespace:
         rig.wait_for_value('images processed', COUNT)
         wait_until(lambda: stamp_ns(rig.listener.messages(PATH)[-1]) == STAMPS_NS[-1])
         state, paths = rig.state(), rig.listener.messages(PATH)
+        outputs = dict(rig.listener.node.get_publisher_names_and_types_by_node('kfvo', '/'))
         took = rig.stop()
     return SimpleNamespace(messages=messages, state=state, paths=paths, took=took, file=file,
-                           code=rig.process.returncode, lines=rig.lines)
+                           code=rig.process.returncode, lines=rig.lines, outputs=outputs)
 
 
 @pytest.fixture(scope='module')
@@ -110,8 +116,9 @@ def test_path_is_refined_and_bounded(drive, offline):
 def test_diagnostics_count(drive):
     level, summary, values = drive.state
     assert (level, summary) == (0, 'tracking')
-    counted = ('images received', 'images processed', 'images dropped', 'images refused', 'resets')
-    assert [values[key] for key in counted] == [str(COUNT), str(COUNT), '0', '0', '0']
+    counted = ('images lost in transit', 'images received', 'images processed', 'images dropped',
+               'images refused', 'resets')
+    assert [values[key] for key in counted] == ['0', str(COUNT), str(COUNT), '0', '0', '0']
     assert 1 <= int(values['keyframes']) <= COUNT
     assert float(values['latency median [ms]']) > 0.0 and float(values['memory [MiB]']) > 10.0
     assert (values['backbone'], values['keyframe policy']) == ('geometric', 'survival')
@@ -124,10 +131,35 @@ def test_trajectory_file_is_that_of_the_odometry_offline(drive, offline):
     assert not np.allclose(written.poses, offline.arrivals, atol=1e-6)  # it is refined
 
 
+@pytest.mark.parametrize(('file', 'shown'), [
+    ('rviz/kfvo.rviz', {ODOMETRY, PATH}),
+    ('foxglove/kfvo.json', {ODOMETRY, PATH, '/kfvo/keyframe', DIAGNOSTICS})])
+def test_viewers_show_what_it_publishes(drive, file, shown):
+    text = (Path(__file__).parents[1] / file).read_text()
+    assert set(re.findall(r'/(?:kfvo/\w+|diagnostics)', text)) == shown <= set(drive.outputs)
+
+
 def test_it_logs_nothing_but_information(drive):
     assert (drive.code, drive.took < 2.0) == (0, True)
     problems = [line for line in drive.lines if '[INFO]' not in line and 'tf2_ros' not in line]
     assert problems == []
+
+
+def test_the_pose_of_a_base_that_carries_the_camera(offline):
+    """In odometry and path: odom is where the base, not the camera, was at first."""
+    T_base_camera = geometry.transform_from_xyz_quat(np.array(MOUNTING))
+    with Rig(base_frame='base_link', base_to_camera=' '.join(map(str, MOUNTING)),
+             path_rate=20.0) as rig:
+        messages = rig.drive(make_frames()[:12])
+        wait_until(lambda: stamp_ns(rig.listener.messages(PATH)[-1]) == STAMPS_NS[11])
+        path = rig.listener.messages(PATH)[-1]
+    assert {(message.header.frame_id, message.child_frame_id)
+            for message in messages} == {('odom', 'base_link')}
+    expected = T_base_camera @ np.array(offline.arrivals[:12]) @ np.linalg.inv(T_base_camera)
+    found = [to_pose(message.pose.pose) for message in messages]
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+    np.testing.assert_allclose(to_pose(path.poses[-1].pose), expected[-1], atol=1e-9)
+    np.testing.assert_allclose(to_pose(path.poses[0].pose), np.eye(4), atol=1e-12)
 
 
 @pytest.mark.parametrize('sent', [signal.SIGINT, signal.SIGTERM])

@@ -21,6 +21,7 @@ from kfvo_ros.live import LiveOdometry, LivePose
 from kfvo_ros.options import OdometryOptions
 from kfvo_ros.ros import monitor as monitoring
 from kfvo_ros.ros.messages import make_header
+from kfvo_ros.ros.numbering import Numbering
 from kfvo_ros.ros.worker import Worker
 from kfvo_ros.trajectory import NANOSECONDS, read_tum
 from kfvo_ros.trajectory_log import TrajectoryLog, free_path
@@ -168,6 +169,39 @@ def test_worker_takes_the_newest_and_counts_what_is_dropped():
     wait_until(idle.is_set)
     worker.stop()
     assert taken == [0, 4, 5]
+
+
+@pytest.mark.parametrize('publishers', [1, 2, 3])
+@pytest.mark.parametrize('seed', range(20))
+def test_lost_messages_are_counted_whoever_sent_them(publishers, seed):
+    """Each publisher's numbers rise from somewhere; nobody tells which are whose."""
+    random = np.random.default_rng(seed)
+    streams, lost = [], 0
+    for _ in range(publishers):
+        came = random.random(100) < 0.7
+        came[[0, -1]] = True  # what was lost before and after these, nobody can know
+        numbers = random.choice([1, 1000]) + np.flatnonzero(came)
+        lost += int((~came).sum())
+        streams.append(list(map(int, numbers)))
+    numbering, found = Numbering(), 0
+    numbering.begin(publishers)
+    found += sum(numbering.missing(stream.pop(0)) for stream in streams)
+    while any(streams):
+        stream = streams[random.choice([i for i, left in enumerate(streams) if left])]
+        found += numbering.missing(stream.pop(0))
+    assert lost > 10 and found == lost
+
+
+def test_publishers_that_come_anew_lost_nothing():
+    numbering = Numbering()
+    numbering.begin(1)
+    assert [numbering.missing(number) for number in (7, 8, 11)] == [0, 0, 2]
+    numbering.begin(1)  # it was started again
+    assert [numbering.missing(number) for number in (30, 31, 33)] == [0, 0, 1]
+    assert [numbering.missing(number) for number in (1, 2, 4)] == [0, 0, 1]  # untold
+    numbering.begin(2)
+    assert [numbering.missing(number) for number in (5, 500, 6, 503)] == [0, 0, 0, 2]
+    assert numbering.missing(None) == 0
 
 
 def test_monitor_tells_what_is_wrong(monkeypatch):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from node_rig import HEIGHT, WIDTH, Rig, make_frames, stamp_ns, std_srvs, to_pose
+from node_rig import HEIGHT, WIDTH, Rig, is_origin, make_frames, stamp_ns, std_srvs, to_pose
 from ros_processes import wait_until
 
 from kfvo_ros import geometry
@@ -25,10 +25,6 @@ def rig(tmp_path_factory):
     with Rig(trajectory_file=file) as rig:
         rig.file = file
         yield rig
-
-
-def is_origin(message) -> bool:
-    return bool(np.allclose(to_pose(message.pose.pose), np.eye(4), atol=1e-12))
 
 
 def test_reset_makes_the_next_image_the_origin(rig):

@@ -149,6 +149,8 @@ class Backbone(ABC):
     descriptor_size: int
     signal_names: tuple[str, ...] = ()
     default_scale_rule: str = 'translation'
+    unit: str = "the first window's own"
+    """What a trajectory's unit of length is, in words."""
 
     @abstractmethod
     def open(self, camera: Camera | None) -> Stream:

@@ -12,7 +12,11 @@ from collections.abc import Callable
 from typing import Any
 
 from rclpy.clock import Clock, ClockType
-from rclpy.event_handler import QoSRequestedIncompatibleQoSInfo, SubscriptionEventCallbacks
+from rclpy.event_handler import (
+    QoSRequestedIncompatibleQoSInfo,
+    QoSSubscriptionMatchedInfo,
+    SubscriptionEventCallbacks,
+)
 from rclpy.node import Node
 from rclpy.qos import (
     DurabilityPolicy,
@@ -23,6 +27,8 @@ from rclpy.qos import (
 )
 from rclpy.subscription import Subscription
 
+from kfvo_ros.ros.numbering import Numbering
+
 POLL_S = 0.1
 """How often to look for a publisher."""
 WAITING = 'waiting'
@@ -32,7 +38,8 @@ WAITING = 'waiting'
 class Following:
     """Subscribes to `topic` as soon as somebody publishes it, as reliably as they do.
 
-    `reliability` is auto, reliable or best_effort; the last two subscribe at once.
+    `reliability` is auto, reliable or best_effort; the last two subscribe at once. ``lost``
+    counts the messages that did not come between others that did.
     """
 
     def __init__(self, node: Node, message_type: Any, topic: str, depth: int,
@@ -40,6 +47,8 @@ class Following:
         self.topic = node.resolve_topic_name(topic)
         self._node, self._type, self._callback = node, message_type, callback
         self._depth = depth
+        self._numbering = Numbering()
+        self.lost = 0
         self._auto = reliability == 'auto'
         self._subscription: Subscription | None = None
         if self._auto:
@@ -92,9 +101,21 @@ class Following:
     def _subscribe(self, reliability: ReliabilityPolicy, durability: DurabilityPolicy) -> None:
         qos = QoSProfile(depth=self._depth, history=HistoryPolicy.KEEP_LAST,
                          reliability=reliability, durability=durability)
+        self._numbering = Numbering()
+        receive: Callable[..., None] = self._receive  # whose second argument rclpy's types lack
         self._subscription = self._node.create_subscription(
-            self._type, self.topic, self._callback, qos,
-            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=self._incompatible))
+            self._type, self.topic, receive, qos,
+            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=self._incompatible,
+                                                       matched=self._matched))
+
+    def _receive(self, message: Any, info: dict[str, Any]) -> None:
+        self.lost += self._numbering.missing(info['publication_sequence_number'])
+        self._callback(message)
+
+    def _matched(self, event: QoSSubscriptionMatchedInfo) -> None:
+        """A publisher came or went; of one that came, this is told before its messages."""
+        if event.total_count_change > 0:
+            self._numbering.begin(event.current_count)
 
     def _incompatible(self, event: QoSRequestedIncompatibleQoSInfo) -> None:
         """A publisher offers less than was asked for: ask for less, or tell how to."""

@@ -23,14 +23,14 @@ RECENT, RECENT_LATENCIES = 100, 1000
 class Monitor:
     """Counters of one node; every method may be called from any thread.
 
-    ``problem`` is what keeps the node from working now, in words, or empty; it is cleared by the
-    next frame that gets a pose.
+    ``missed`` images were lost before the node got them. ``problem`` is what keeps the node from
+    working now, in words, or empty; it is cleared by the next frame that gets a pose.
     """
 
     def __init__(self) -> None:
         self.started = time.monotonic()
         self.received = self.processed = self.keyframes = self.dropped = self.refused = 0
-        self.lost = self.resets = 0
+        self.missed = self.lost = self.resets = 0
         self.paused = False
         self.status: Status | None = None
         self.problem = ''
@@ -78,6 +78,7 @@ class Monitor:
             'output rate [Hz]': f'{_rate(self._departures):.1f}',
             'latency median [ms]': f'{self.latency_ms(50):.1f}',
             'latency 95 % [ms]': f'{self.latency_ms(95):.1f}',
+            'images lost in transit': self.missed,
             'images received': self.received, 'images processed': self.processed,
             'images dropped': self.dropped, 'images refused': self.refused,
             'keyframes': self.keyframes,

@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+import time
+
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
@@ -69,18 +71,21 @@ class KfvoNode(Node):
     def _introduce(self, odometry: OdometryOptions, options: NodeOptions,
                    cameras: CameraSource) -> None:
         say = self.get_logger().info
-        say(f'kfvo_ros {__version__}: {odometry.backbone} backbone, keyframes by '
+        backbone = self._pipeline.backbone
+        say(f'kfvo_ros {__version__}: {backbone.name} backbone '
+            f'({", ".join(backbone.condition().values())}), keyframes by '
             f'{self._pipeline.policy_name}, window of {odometry.window_size}')
-        say(f'images: {self._images.topic} (QoS {options.image_qos}), calibration: '
-            f'{cameras.name}, frames: {options.odom_frame} -> '
-            f'{options.base_frame or "<camera frame>_body"}')
+        calibration = cameras.name if backbone.needs_camera else 'not needed'
+        say(f'images: {self._images.topic} (QoS {options.image_qos}), calibration: {calibration}, '
+            f'frames: {options.odom_frame} -> {options.base_frame or "<camera frame>_body"}')
         if options.scale == 1.0:
-            say("the scale of one camera is not metric: the unit is the first scene's median "
-                'depth; set scale [m per unit] where it is known')
+            say(f'the scale of one camera is not metric: the unit is {backbone.unit}; set scale '
+                '[m per unit] where it is known')
         say('ready')
 
     def _on_image(self, message: Image | CompressedImage) -> None:
         arrival = self._monitor.image()
+        self._monitor.missed = self._images.lost
         if not self._monitor.paused:
             self._monitor.dropped += self._worker.put((arrival, message))
 
@@ -111,7 +116,11 @@ class KfvoNode(Node):
             self.get_logger().warning(
                 f'no image on {topic} for {monitor.silence:.0f} s{": " if why else ""}{why}',
                 throttle_duration_sec=SILENCE_S)
-        header = make_header(self.get_clock().now().nanoseconds, '')
+        now_ns = self.get_clock().now().nanoseconds
+        if now_ns == 0 and time.monotonic() - monitor.started > SILENCE_S:
+            self.get_logger().warning(
+                f'use_sim_time is set, but no /clock came for {SILENCE_S:.0f} s: play the bag '
+                'with --clock, or unset use_sim_time', once=True)
         self._diagnostics.publish(monitor.message(
-            header, f'{self.get_name()}: odometry', topic,
+            make_header(now_ns, ''), f'{self.get_name()}: odometry', topic,
             self._constants | self._pipeline.backbone.condition()))

@@ -46,7 +46,8 @@ class NodeOptions:
         '', 'where the camera is on the base: "x y z qx qy qz qw"; empty: from TF')
     camera_frame: str = option('', "optical frame of the camera; empty: the images' frame_id")
     scale: float = option(
-        1.0, "metres per unit of the trajectory, whose unit is the first scene's median depth",
+        1.0, "metres per unit of the trajectory; of the geometric backbone the unit is the first "
+        "scene's median depth",
         least=1e-9, most=1e9)
     publish_tf: bool = option(True, 'send the pose as TF too')
     path_max_length: int = option(1000, 'poses in the path; 0: all', least=0)

@@ -61,6 +61,7 @@ class GeometricBackbone(Backbone):
     descriptor_size = THUMBNAIL[0] * THUMBNAIL[1]
     signal_names = SIGNAL_NAMES
     default_scale_rule = 'depth'
+    unit = "the first scene's median depth"
 
     def __init__(self, seed: int = 0) -> None:
         self._seed = seed
