@@ -11,6 +11,10 @@ class KfvoError(Exception):
     """
 
 
+class MemoryFullError(KfvoError):
+    """There is not memory enough; it will not be the next time either."""
+
+
 def reason_of(error: Exception) -> str:
     """Return what an error of somebody else says, in one line.
 

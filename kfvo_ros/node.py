@@ -39,10 +39,10 @@ def _run(argv: list[str]) -> None:
 
 
 def _parse(argv: list[str]) -> None:
-    from kfvo_ros.options import OdometryOptions
+    from kfvo_ros.options import OdometryOptions, VggtOptions
     from kfvo_ros.ros.parameters import NodeOptions, describe
     make_parser('kfvo_node', 'Visual odometry of one camera. All choices are ROS parameters:\n\n'
-                + describe(NodeOptions, OdometryOptions), EXAMPLES).parse_args(argv)
+                + describe(NodeOptions, OdometryOptions, VggtOptions), EXAMPLES).parse_args(argv)
 
 
 if __name__ == '__main__':

@@ -19,6 +19,8 @@ PARAMETERS = {
     'image_topic': 'images to follow; ends in /compressed for CompressedImage',
     'camera_info_file': 'calibration (camera_info.yaml) that wins over the CameraInfo topic',
     'keyframes': 'keyframe policy: every, optical_flow or survival',
+    'backbone': 'model: geometric, or vggt on a GPU',
+    'weights': 'weights of vggt: a repository on the hub, or a file',
     'base_frame': 'frame whose pose is given, such as base_link',
     'base_to_camera': 'where the camera is on the base: "x y z qx qy qz qw"',
     'scale': 'metres per unit of the trajectory',

@@ -15,7 +15,7 @@ import yaml
 
 from kfvo_ros.camera import read_camera_info
 from kfvo_ros.config_files import find_config
-from kfvo_ros.options import OdometryOptions
+from kfvo_ros.options import OdometryOptions, VggtOptions
 from kfvo_ros.sequences.tum import FREIBURG
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -24,7 +24,7 @@ PRESETS = ('euroc', 'tum', 'kitti')
 
 def node_parameters() -> set[str]:
     parameters = pytest.importorskip('kfvo_ros.ros.parameters', reason='rclpy is not installed')
-    return {field.name for kind in (OdometryOptions, parameters.NodeOptions)
+    return {field.name for kind in (OdometryOptions, VggtOptions, parameters.NodeOptions)
             for field in fields(kind)}
 
 

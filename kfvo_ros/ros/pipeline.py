@@ -16,7 +16,7 @@ from sensor_msgs.msg import CompressedImage, Image
 from kfvo_ros.assembly import make_odometry
 from kfvo_ros.backbones.base import Backbone
 from kfvo_ros.camera import Camera
-from kfvo_ros.errors import KfvoError
+from kfvo_ros.errors import KfvoError, MemoryFullError, reason_of
 from kfvo_ros.live import LiveOdometry
 from kfvo_ros.options import OdometryOptions
 from kfvo_ros.ros.camera_source import CameraSource
@@ -94,10 +94,16 @@ class Pipeline:
         """Tell of an error instead of raising it: a robot's odometry must not end by one."""
         try:
             yield
+        except MemoryFullError as error:
+            self._refuse(error)
+            self._logger.error(str(error), once=True)
         except KfvoError as error:
-            self._refuse(str(error))
-        except Exception:
-            self._refuse(f'unexpected error, starting anew:\n{traceback.format_exc()}')
+            self._refuse(error)
+            self._logger.error(str(error), throttle_duration_sec=QUIET_S)
+        except Exception as error:
+            self._refuse(error)
+            self._logger.error(f'unexpected error, starting anew:\n{traceback.format_exc()}',
+                               throttle_duration_sec=QUIET_S)
             self._end_segment()
 
     def _handle(self, arrival: float, message: Image | CompressedImage) -> None:
@@ -160,7 +166,6 @@ class Pipeline:
         name = self._options.trajectory_file
         return TrajectoryLog(free_path(Path(name).expanduser()) if name else None)
 
-    def _refuse(self, problem: str) -> None:
+    def _refuse(self, error: Exception) -> None:
         self._monitor.refused += 1
-        self._monitor.problem = problem.splitlines()[0]
-        self._logger.error(problem, throttle_duration_sec=QUIET_S)
+        self._monitor.problem = reason_of(error)

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 import torch
 
-from kfvo_ros.errors import KfvoError
+from kfvo_ros.errors import MemoryFullError
 
 CPU_ALLOCATOR = "can't allocate memory"
 """What torch says where the processor's memory ends; it has no type of its own."""
@@ -17,7 +17,7 @@ CPU_ALLOCATOR = "can't allocate memory"
 
 @contextmanager
 def memory_bounded(device: torch.device) -> Iterator[None]:
-    """Turn an allocation that failed into a KfvoError with the remedies."""
+    """Turn an allocation that failed into a MemoryFullError with the remedies."""
     try:
         yield
     except (torch.OutOfMemoryError, MemoryError, RuntimeError) as error:
@@ -25,5 +25,5 @@ def memory_bounded(device: torch.device) -> Iterator[None]:
             raise
         if device.type == 'cuda':
             torch.cuda.empty_cache()
-        raise KfvoError(f'the memory of {device} is full: make window_size or image_width '
-                        'smaller, or set precision to bf16') from error
+        raise MemoryFullError(f'the memory of {device} is full: make window_size or image_width '
+                              'smaller, or set precision to bf16') from error
