@@ -27,7 +27,8 @@ STOP_S = 5.0
 class Heard:
     """What a node said from its start to its end; latencies from an image's arrival [ms].
 
-    Of its images, `missed` were lost before it, and `dropped` of the `received` by itself.
+    Of its images, `missed` were lost before it, and `dropped` of the `received` by itself. It used
+    `memory_mb` [MiB], each second.
     """
 
     stamps_ns: list[int]
@@ -37,6 +38,7 @@ class Heard:
     dropped: int
     latency_median_ms: float
     latency_p95_ms: float
+    memory_mb: list[float]
 
 
 def rehearse(bag: Path, topic: str, parameters: dict[str, object], rate: float = 1.0) -> Heard:
@@ -74,7 +76,8 @@ def rehearse(bag: Path, topic: str, parameters: dict[str, object], rate: float =
     missed, received, dropped = (int(values[f'images {what}'])
                                  for what in ('lost in transit', 'received', 'dropped'))
     return Heard(witness.stamps_ns, witness.keyframes_ns, missed, received, dropped,
-                 float(values['latency median [ms]']), float(values['latency 95 % [ms]']))
+                 float(values['latency median [ms]']), float(values['latency 95 % [ms]']),
+                 witness.memory_mb)
 
 
 

@@ -26,6 +26,7 @@ from kfvo_ros.trajectory import NANOSECONDS
 
 builtin_interfaces = pytest.importorskip('builtin_interfaces.msg')
 diagnostic_msgs = pytest.importorskip('diagnostic_msgs.msg')
+geometry_msgs = pytest.importorskip('geometry_msgs.msg')
 nav_msgs = pytest.importorskip('nav_msgs.msg')
 rosgraph_msgs = pytest.importorskip('rosgraph_msgs.msg')
 sensor_msgs = pytest.importorskip('sensor_msgs.msg')
@@ -34,7 +35,8 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy  # noqa: E402
 
 NODE = 'kfvo_ros.node'
 IMAGE, INFO = '/camera/image_raw', '/camera/camera_info'
-ODOMETRY, PATH, DIAGNOSTICS = '/kfvo/odometry', '/kfvo/path', '/diagnostics'
+ODOMETRY, PATH, KEYFRAME = '/kfvo/odometry', '/kfvo/path', '/kfvo/keyframe'
+DIAGNOSTICS = '/diagnostics'
 WIDTH, HEIGHT, COUNT = 320, 240, 40
 WARN = 1
 RELIABLE = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
@@ -95,7 +97,7 @@ class Rig:
     def __init__(self, image_type: Any = None, topic: str = IMAGE, qos: QoSProfile = RELIABLE,
                  late: bool = False, **parameters: Any) -> None:
         self.listener = Listener({
-            ODOMETRY: nav_msgs.Odometry, PATH: nav_msgs.Path,
+            ODOMETRY: nav_msgs.Odometry, PATH: nav_msgs.Path, KEYFRAME: geometry_msgs.PoseStamped,
             DIAGNOSTICS: diagnostic_msgs.DiagnosticArray})
         self.lines: list[str] = []
         self._image_type, self._topic, self._qos = image_type or sensor_msgs.Image, topic, qos

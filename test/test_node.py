@@ -15,6 +15,7 @@ import pytest
 from node_rig import (
     COUNT,
     DIAGNOSTICS,
+    KEYFRAME,
     NODE,
     ODOMETRY,
     PATH,
@@ -47,10 +48,12 @@ def drive(tmp_path_factory) -> SimpleNamespace:
         rig.wait_for_value('images processed', COUNT)
         wait_until(lambda: stamp_ns(rig.listener.messages(PATH)[-1]) == STAMPS_NS[-1])
         state, paths = rig.state(), rig.listener.messages(PATH)
+        keyframes = rig.listener.messages(KEYFRAME)
         outputs = dict(rig.listener.node.get_publisher_names_and_types_by_node('kfvo', '/'))
         took = rig.stop()
     return SimpleNamespace(messages=messages, state=state, paths=paths, took=took, file=file,
-                           code=rig.process.returncode, lines=rig.lines, outputs=outputs)
+                           code=rig.process.returncode, lines=rig.lines, outputs=outputs,
+                           keyframes=keyframes)
 
 
 @pytest.fixture(scope='module')
@@ -124,6 +127,14 @@ def test_diagnostics_count(drive):
     assert (values['backbone'], values['keyframe policy']) == ('geometric', 'survival')
 
 
+def test_keyframes_are_poses_again(drive):
+    stamps = [stamp_ns(message) for message in drive.keyframes]
+    assert str(len(stamps)) == drive.state[2]['keyframes'] and 0 < len(stamps) < COUNT
+    poses = {stamp_ns(message): message.pose.pose for message in drive.messages}
+    assert [message.pose for message in drive.keyframes] == [poses[stamp] for stamp in stamps]
+    assert {message.header.frame_id for message in drive.keyframes} == {'odom'}
+
+
 def test_trajectory_file_is_that_of_the_odometry_offline(drive, offline):
     written = read_tum(drive.file)
     assert list(written.stamps_ns) == STAMPS_NS
@@ -133,7 +144,7 @@ def test_trajectory_file_is_that_of_the_odometry_offline(drive, offline):
 
 @pytest.mark.parametrize(('file', 'shown'), [
     ('rviz/kfvo.rviz', {ODOMETRY, PATH}),
-    ('foxglove/kfvo.json', {ODOMETRY, PATH, '/kfvo/keyframe', DIAGNOSTICS})])
+    ('foxglove/kfvo.json', {ODOMETRY, PATH, KEYFRAME, DIAGNOSTICS})])
 def test_viewers_show_what_it_publishes(drive, file, shown):
     text = (Path(__file__).parents[1] / file).read_text()
     assert set(re.findall(r'/(?:kfvo/\w+|diagnostics)', text)) == shown <= set(drive.outputs)

@@ -28,6 +28,7 @@ from node_rig import (
 )
 from ros_processes import ENVIRONMENT, Listener, rclpy, wait_until
 
+from kfvo_ros.ros.following import Following
 from kfvo_ros.trajectory import NANOSECONDS
 
 FRAMES = make_frames()
@@ -77,6 +78,23 @@ def test_a_camera_that_stops_is_missed_and_welcome_again():
         assert counted(rig, 'lost in transit') == [0]  # another publisher, which begins at 1
 
 
+def test_what_cameras_sent_before_they_were_found_is_not_lost():
+    """Two of them, whose images bear different numbers by then."""
+    heard = []
+    with Listener({}) as ours, Listener({}) as theirs:
+        first, second = (theirs.node.create_publisher(sensor_msgs.Image, IMAGE, RELIABLE)
+                         for _ in range(2))
+        for _ in range(100):
+            second.publish(sensor_msgs.Image())
+        following = Following(ours.node, sensor_msgs.Image, IMAGE, 100, heard.append, 'reliable')
+        for camera in (first, second):
+            wait_until(camera.get_subscription_count)
+        for count, camera in enumerate((first, second) * 3, 1):
+            camera.publish(sensor_msgs.Image())
+            wait_until(lambda count=count: len(heard) == count)
+        assert following.lost == 0
+
+
 LARGE = """
 import time
 import rclpy
@@ -120,7 +138,10 @@ def test_simulated_time_that_never_begins_is_told_once_and_stops_nothing():
         assert stamp_ns(told) == 0
         assert np.diff(rig.listener.arrivals(DIAGNOSTICS)).max() < 2.0
         clock = rig.listener.node.create_publisher(rosgraph_msgs.Clock, '/clock', 1)
-        wait_until(clock.get_subscription_count)
-        clock.publish(rosgraph_msgs.Clock(clock=builtin_interfaces.Time(sec=70)))
-        wait_until(lambda: stamp_ns(rig.listener.messages(DIAGNOSTICS)[-1]) == 70 * NANOSECONDS)
+
+        def is_heard() -> bool:
+            clock.publish(rosgraph_msgs.Clock(clock=builtin_interfaces.Time(sec=70)))
+            return stamp_ns(rig.listener.messages(DIAGNOSTICS)[-1]) == 70 * NANOSECONDS
+
+        wait_until(is_heard)
         assert sum('/clock' in line for line in rig.lines) == 1

@@ -17,7 +17,8 @@ from kfvo_ros.ros.messages import to_stamp_ns
 class Witness(Node):
     """Keeps what the node of this `name` says.
 
-    ``stamps_ns`` of its poses, ``keyframes_ns`` of those kept, ``values`` of its diagnostics.
+    ``stamps_ns`` of its poses, ``keyframes_ns`` of those kept, ``values`` of its last diagnostics,
+    and ``memory_mb`` it used [MiB], each second.
     """
 
     def __init__(self, name: str = '/kfvo') -> None:
@@ -25,6 +26,7 @@ class Witness(Node):
         self.stamps_ns: list[int] = []
         self.keyframes_ns: list[int] = []
         self.values: dict[str, str] = {}
+        self.memory_mb: list[float] = []
         self._last = time.monotonic()
         self.create_subscription(Odometry, f'{name}/odometry', self._on_odometry, 1000)
         self.create_subscription(PoseStamped, f'{name}/keyframe', self._on_keyframe, 1000)
@@ -47,3 +49,4 @@ class Witness(Node):
         for status in message.status:
             if status.name.endswith(': odometry'):
                 self.values = {value.key: value.value for value in status.values}
+                self.memory_mb.append(float(self.values['memory [MiB]']))

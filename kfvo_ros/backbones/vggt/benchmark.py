@@ -22,6 +22,7 @@ from torch.nn import functional
 
 from kfvo_ros.backbones.vggt.config import PATCH, VggtConfig
 from kfvo_ros.backbones.vggt.out_of_memory import memory_bounded
+from kfvo_ros.backbones.vggt.packing import pack
 from kfvo_ros.backbones.vggt.precision import PRECISIONS, choose_device, choose_dtype
 from kfvo_ros.backbones.vggt.rehearsal import STEPS, Scene, count_flops, random_model
 from kfvo_ros.commands import make_parser, run_command
@@ -73,7 +74,8 @@ def _compare(arguments: argparse.Namespace, device: torch.device) -> None:
     """Time the steps and print the table."""
     dtype = choose_dtype(arguments.precision, device)
     shape: tuple[int, int, int] = (*arguments.size, arguments.frames)
-    ours = Scene(random_model(device, dtype), *shape)
+    model = random_model(device, dtype)
+    ours = Scene(pack(model) if device.type == 'cpu' else model, *shape)
     official = arguments.against == 'official'
     plain = ours if arguments.against == 'same' else Scene(
         random_model(device, torch.float32), *shape, autocast=official)

@@ -70,10 +70,10 @@ class Attention(nn.Module):
 
     def __init__(self, width: int, heads: int, qk_norm: bool) -> None:
         super().__init__()
-        self.heads = heads
+        self.heads, self.channels = heads, width // heads
         self.qkv = Linear(width, 3 * width)
-        self.q_norm = LayerNorm(width // heads) if qk_norm else nn.Identity()
-        self.k_norm = LayerNorm(width // heads) if qk_norm else nn.Identity()
+        self.q_norm = LayerNorm(self.channels) if qk_norm else nn.Identity()
+        self.k_norm = LayerNorm(self.channels) if qk_norm else nn.Identity()
         self.proj = Linear(width, width)
 
     def project(self, x: Tensor, rotary: Rotary | None) -> QueriesKeysValues:
@@ -98,9 +98,7 @@ class Attention(nn.Module):
 
     def _split(self, x: Tensor) -> tuple[Tensor, ...]:
         """Cut (B, N, parts x width) into parts (B, heads, N, channels)."""
-        width = self.proj.in_features
-        return x.unflatten(-1, (-1, self.heads, width // self.heads)).permute(
-            2, 0, 3, 1, 4).unbind(0)
+        return x.unflatten(-1, (-1, self.heads, self.channels)).permute(2, 0, 3, 1, 4).unbind(0)
 
 
 class Block(nn.Module):

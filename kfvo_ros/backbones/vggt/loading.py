@@ -12,6 +12,7 @@ from kfvo_ros.backbones.base import Window
 from kfvo_ros.backbones.vggt.backbone import VggtBackbone
 from kfvo_ros.backbones.vggt.checkpoint import load_model
 from kfvo_ros.backbones.vggt.out_of_memory import memory_bounded
+from kfvo_ros.backbones.vggt.packing import pack
 from kfvo_ros.backbones.vggt.precision import choose_device, choose_dtype
 from kfvo_ros.backbones.vggt.weights import locate
 from kfvo_ros.sequences.base import Frame
@@ -33,6 +34,8 @@ def load_backbone(weights: str, revision: str | None, device: str, precision: st
     with memory_bounded(place):
         model = load_model(path, place, dtype)
     logging.getLogger(__name__).info('%s on %s, matrices in %s', path, place, dtype)
+    if place.type == 'cpu':
+        pack(model)
     backbone = VggtBackbone(model, image_width, reuse)
     if place.type == 'cuda':
         warm_up(backbone, window_size)

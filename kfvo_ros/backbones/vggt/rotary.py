@@ -28,7 +28,7 @@ class Rotary(NamedTuple):
     def turn(self, x: Tensor) -> Tensor:
         """Turn queries or keys x (..., N, HEAD_SIZE)."""
         partner = x.unflatten(-1, (2, 2, -1)).flip(-2).flatten(-3)
-        return x * self.cos + partner * self.sin
+        return torch.addcmul(x * self.cos, partner, self.sin)
 
     def repeat(self, frames: int) -> Rotary:
         """Return the table of several frames one after the other: they share their places."""
