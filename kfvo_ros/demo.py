@@ -72,7 +72,7 @@ def _evaluate(folder: Path, text: str, truth: Any, heard: Any) -> dict[str, Any]
     summary = {
         'sequence': text, 'version': __version__, 'frames': heard.received,
         'poses': len(heard.stamps_ns), 'dropped': heard.dropped,
-        'keyframes': len(heard.keyframes_ns),
+        'lost_in_transit': heard.missed, 'keyframes': len(heard.keyframes_ns),
         'latency_ms': {'median': heard.latency_median_ms, 'p95': heard.latency_p95_ms},
         **evaluate(estimate, GroundTruth(truth))}
     (folder / SUMMARY).write_text(json.dumps(summary, indent=2) + '\n', encoding='utf-8')
@@ -88,7 +88,9 @@ def _table(summary: dict[str, Any], folder: Path) -> str:
     latency = summary['latency_ms']
     share = 100.0 * summary['ate_rmse_m'] / summary['path_length_m']
     rows = [('frames received', summary['frames']), ('poses published', summary['poses']),
-            ('frames dropped', summary['dropped']), ('keyframes', summary['keyframes']),
+            ('frames dropped', summary['dropped']),
+            ('frames lost in transit', summary['lost_in_transit']),
+            ('keyframes', summary['keyframes']),
             ('ATE after Sim(3)', f'{summary["ate_rmse_m"]:.4f} m, {share:.2f} % of '
                                  f'{summary["path_length_m"]:.2f} m'),
             ('latency', f'{latency["median"]:.1f} ms median, {latency["p95"]:.1f} ms at 95 %')]
