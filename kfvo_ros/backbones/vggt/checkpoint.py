@@ -15,7 +15,8 @@ from torch import Tensor
 from kfvo_ros.backbones.vggt.config import config_of
 from kfvo_ros.backbones.vggt.model import Vggt
 from kfvo_ros.backbones.vggt.precision import set_precision
-from kfvo_ros.errors import KfvoError, reason_of
+from kfvo_ros.errors import KfvoError, MemoryFullError, reason_of
+from kfvo_ros.memory_use import available_mb
 
 PARTS = ('aggregator.', 'camera_head.')
 """What is built; the heads for depth, points and tracks of a full checkpoint are skipped."""
@@ -42,6 +43,8 @@ def load_model(path: Path, device: torch.device, dtype: torch.dtype) -> Vggt:
     except KfvoError as error:
         raise KfvoError(f'{path}: {error}') from error
     del found
+    if device.type == 'cpu':
+        _make_sure_of_memory(sum(each.numel() * each.itemsize for each in wanted.values()))
     names, loaded = list(wanted), dict[str, Tensor]()
     for first in range(0, len(names), AT_ONCE):
         mapped = _map(path)
@@ -49,6 +52,15 @@ def load_model(path: Path, device: torch.device, dtype: torch.dtype) -> Vggt:
                    for name in names[first:first + AT_ONCE]}
     model.load_state_dict(loaded, assign=True)
     return model.eval().requires_grad_(False)
+
+
+def _make_sure_of_memory(needed: int) -> None:
+    """Raise MemoryFullError for more than there is: Linux would promise it, and kill later."""
+    needed_mb, free_mb = needed / 1024.0 ** 2, available_mb()
+    if needed_mb > free_mb:
+        raise MemoryFullError(f'the weights take {needed_mb:.0f} MiB, {free_mb:.0f} are free: set '
+                              'precision to bf16, which takes little more than half, or close '
+                              'what else is running')
 
 
 def _map(path: Path) -> dict[str, Tensor]:
