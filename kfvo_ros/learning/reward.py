@@ -1,0 +1,73 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What a decision was worth, from the window's poses against the truth (paper, section IV-D)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kfvo_ros import geometry
+from kfvo_ros.geometry import Similarity
+
+ERROR_WEIGHT, KEYFRAME_WEIGHT = 0.01, 0.005
+ACCEPTED_ERROR = 0.2
+"""An error of so many metres is worth nothing, neither good nor bad."""
+WORST = -1.0
+ALPHA = 2.5e-5
+"""What a keyframe is worth as the paper prints it; as a penalty the sign turns."""
+ALIGNED = 5
+"""The first poses of the window are brought onto the truth."""
+THIN = 0.05
+"""Positions whose second singular value is below this share of the first lie on a line: they
+tell no rotation about it."""
+STANDSTILL_M = 0.01
+"""Where the truth moved less, no scale can be told."""
+
+
+class PaperReward:
+    """The error of the newest frame once the window's first poses are aligned to the truth.
+
+    Remembers the last scale, for windows at rest. `alpha` is added, weighted, for a keyframe.
+    """
+
+    def __init__(self, alpha: float = ALPHA) -> None:
+        self._alpha = alpha
+        self._scale = 1.0
+
+    def __call__(self, T_world_frame: np.ndarray, T_truth_frame: np.ndarray,
+                 keep: bool) -> float:
+        """Return the reward of a decision on a window, estimated and true poses (S, 4, 4)."""
+        error = self.error(T_world_frame, T_truth_frame)
+        return (ERROR_WEIGHT * max(WORST, ACCEPTED_ERROR - error)
+                + KEYFRAME_WEIGHT * self._alpha * keep)
+
+    def error(self, T_world_frame: np.ndarray, T_truth_frame: np.ndarray) -> float:
+        """Return the position error of the window's newest frame [m]."""
+        alignment = align(T_world_frame[:ALIGNED], T_truth_frame[:ALIGNED], self._scale)
+        self._scale = alignment.scale
+        newest = alignment.transform_points(T_world_frame[-1:, :3, 3])[0]
+        return float(np.linalg.norm(newest - T_truth_frame[-1, :3, 3]))
+
+
+def align(T_world_frame: np.ndarray, T_truth_frame: np.ndarray, last_scale: float) -> Similarity:
+    """Return the similarity from the world to the truth that a few poses (N, 4, 4) tell.
+
+    Positions of a window are nearly on a line in most: then the orientations tell the rotation,
+    and the positions scale and translation only. Of poses at rest `last_scale` is kept.
+    """
+    source, target = T_world_frame[:, :3, 3], T_truth_frame[:, :3, 3]
+    spread_source, spread_target = (each - each.mean(axis=0) for each in (source, target))
+    at_rest = np.linalg.norm(np.ptp(target, axis=0)) < STANDSTILL_M
+    first, second, *_ = np.linalg.svd(spread_target, compute_uv=False)
+    if not at_rest and second >= THIN * first and np.ptp(source, axis=0).any():
+        return geometry.umeyama(source, target)
+    # R_truth_frame = R R_world_frame for every frame: the nearest rotation to all of them.
+    rotation = geometry.best_rotation(
+        np.swapaxes(T_world_frame[:, :3, :3], 1, 2).reshape(-1, 3),
+        np.swapaxes(T_truth_frame[:, :3, :3], 1, 2).reshape(-1, 3))
+    scale, power = last_scale, float(np.sum(spread_source ** 2))
+    if not at_rest and power > 0.0:
+        told = float(np.sum(spread_target * (spread_source @ rotation.T))) / power
+        scale = told if told > 0.0 else last_scale
+    return Similarity(scale, rotation,
+                      target.mean(axis=0) - scale * rotation @ source.mean(axis=0))
