@@ -32,3 +32,10 @@ def data_path() -> Callable[[str], Path]:
             pytest.skip(f'no {relative} in KFVO_DATA')
         return path
     return find
+
+
+@pytest.fixture(scope='session')
+def small_vggt(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a file of weights of a small VGGT model, or a skip."""
+    from vggt_models import saved_small
+    return saved_small(tmp_path_factory.mktemp('vggt') / 'small.safetensors')

@@ -22,7 +22,7 @@ from command_lines import assert_one_readable_line, run_python
 import kfvo_ros
 from kfvo_ros.camera import read_camera_info
 from kfvo_ros.errors import KfvoError
-from kfvo_ros.requirements import PIP_NAMES, missing_dependency
+from kfvo_ros.requirements import OPTIONAL_PIP_NAMES, PIP_NAMES, missing_dependency
 
 ROOT = Path(__file__).resolve().parent.parent
 SOURCES = sorted((ROOT / 'kfvo_ros').rglob('*.py'))
@@ -91,17 +91,33 @@ def test_core_imports_without_ros_torch_and_scipy() -> None:
     assert outcome.returncode == 0, outcome.stderr
 
 
+def test_a_node_without_vggt_does_without_torch() -> None:
+    if importlib.util.find_spec('rclpy') is None:
+        pytest.skip("rclpy is not installed: source a ROS 2 or pip install '.[ros]'")
+    code = ('import sys\n'
+            'import kfvo_ros.node, kfvo_ros.run, kfvo_ros.ros.node\n'
+            'from kfvo_ros.assembly import make_odometry\n'
+            'from kfvo_ros.options import OdometryOptions\n'
+            'assert make_odometry(OdometryOptions()).backbone.name == "geometric"\n'
+            'print(*sys.modules)')
+    outcome = run_python('-c', code)
+    assert outcome.returncode == 0, outcome.stderr
+    loaded = set(outcome.stdout.split())
+    assert 'rclpy' in loaded and not loaded & {'torch', 'PIL', 'safetensors', 'huggingface_hub'}
+
+
 # A missing dependency
 
 
-@pytest.mark.parametrize('module', sorted(PIP_NAMES))
-def test_missing_module_names_its_pip_line(module: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(('module', 'name'), sorted({**PIP_NAMES, **OPTIONAL_PIP_NAMES}.items()))
+def test_missing_module_names_its_pip_line(module: str, name: str,
+                                           monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(ModuleNotFoundError) as caught:
         importlib.import_module(module)
     problem = missing_dependency(caught.value)
     assert isinstance(problem, KfvoError)
-    assert str(problem) == f'{module} is missing: pip install {PIP_NAMES[module]}'
+    assert str(problem) == f'{module} is missing: pip install {name}'
 
 
 def test_missing_module_of_ours_stays_an_error() -> None:
@@ -176,6 +192,9 @@ def test_every_requirement_has_a_pip_line_and_a_pin(
     requires = distribution.requires or []
     needed = {re.match(r'[\w.-]+', line)[0] for line in requires if 'extra ==' not in line}
     assert needed == set(PIP_NAMES.values())
+    extra = {re.match(r'[\w.-]+', line)[0].replace('_', '-') for line in requires
+             if re.search(r'extra == .(vggt|demo).', line)}
+    assert extra == set(OPTIONAL_PIP_NAMES.values())
     named = {re.sub(r'[-_.]+', '-', re.match(r'[\w.-]+', line)[0]).lower() for line in requires}
     for file in ('constraints.txt', 'constraints-jazzy.txt'):
         pins = set(re.findall(r'^([\w.-]+)==', (ROOT / file).read_text(), re.MULTILINE))

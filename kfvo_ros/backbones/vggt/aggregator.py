@@ -86,7 +86,8 @@ class Aggregator(nn.Module):
         special = self._special()[role].expand(len(patches), -1, -1)
         frame_block, global_block = self._layers()[0]
         tokens = frame_block(torch.cat([special, patches], dim=1), rotary)
-        return FirstLayer(tokens, *global_block.project(tokens, rotary))
+        q, k, v = global_block.project(tokens, rotary)
+        return FirstLayer(tokens, q, k, v.clone())  # a view would keep all three alive
 
     def relate(self, first: FirstLayer, grid: Grid) -> Tensor:
         """Return features (B, S, 2 width) of windows, given their first layer (B, S, ...)."""

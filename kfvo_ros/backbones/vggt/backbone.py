@@ -82,7 +82,8 @@ class VggtBackbone(Backbone):
             image = pixels.permute(2, 0, 1)[None] / 255.0
             tokens = self.model.aggregator.see(image)
             payload = FrameMemory(fitted, grid_of(image), image[0], tokens[:, SPECIAL:])
-            return Encoded(frame.stamp_ns, tokens[0, 0].float().cpu().numpy(), payload)
+            # Copied: a view would keep the tokens of the whole frame alive.
+            return Encoded(frame.stamp_ns, tokens[0, 0].float().cpu().numpy().copy(), payload)
 
     def estimate(self, windows: Sequence[Window]) -> list[Estimate]:
         """Place the frames of many windows; those alike in frames and size go in one batch."""

@@ -88,14 +88,13 @@ def _compare(arguments: argparse.Namespace, device: torch.device) -> None:
           f'{shape[0]}x{shape[1]}, matrices in {dtype}, plain in '
           f'{"autocast" if official else "fp32" if plain is not ours else dtype}')
     print(f'{"step":12} {"ms":>9} {"ratio":>6} {"TFLOP":>7} {"share":>6} {"of matmul":>9}')
-    whole = count_flops(STEPS['plain'], *shape)
-    for kind, step in STEPS.items():
-        flops = count_flops(step, *shape)
+    counts = {kind: count_flops(step, *shape) for kind, step in STEPS.items()}
+    for kind, flops in counts.items():
         median = statistics.median(times[kind])
         ratio = statistics.median(map(float.__truediv__, times['plain'], times[kind]))
         rate = rates[torch.float32 if kind == 'plain' and plain is not ours else dtype]
         print(f'{kind:12} {1e3 * median:9.1f} {ratio:5.2f}x {flops / 1e12:7.2f} '
-              f'{flops / whole:6.3f} {flops / median / rate:9.2f}')
+              f'{flops / counts["plain"]:6.3f} {flops / median / rate:9.2f}')
     for kind in ('sliding', 'anchor kept'):
         print(f'{kind}: ' + ', '.join(f'{part} {100 * share:.1f} %'
                                       for part, share in _shares(ours, kind).items()))

@@ -23,6 +23,7 @@ PARTS = ('aggregator.', 'camera_head.')
 AT_ONCE = 64
 """Tensors read before the file is closed and opened anew: what is mapped counts as memory."""
 FLOATS = (torch.float32, torch.float16, torch.bfloat16, torch.float64)
+NOT_TENSORS = '{}: expected tensors by name and nothing else, as state_dict() gives them'
 SHOWN = 3
 """So many keys that differ are named."""
 
@@ -33,16 +34,17 @@ def load_model(path: Path, device: torch.device, dtype: torch.dtype) -> Vggt:
     `dtype` is that of `precision.set_precision`. The sizes are read off the tensors. Raises
     KfvoError for a file that cannot be read, or that holds other tensors than a VGGT model's.
     """
-    found = {name: each for name, each in _map(path).items() if name.startswith(PARTS)}
+    mapped = _map(path)
+    found = {name: each for name, each in mapped.items() if name.startswith(PARTS)}
     try:
-        config = config_of({name: tuple(each.shape) for name, each in found.items()})
+        config = config_of({name: tuple(each.shape) for name, each in mapped.items()})
         with torch.device('meta'):
             model = set_precision(Vggt(config), dtype)
         wanted: dict[str, Tensor] = dict(model.named_parameters())
         _compare(found, wanted)
     except KfvoError as error:
         raise KfvoError(f'{path}: {error}') from error
-    del found
+    del found, mapped
     if device.type == 'cpu':
         _make_sure_of_memory(sum(each.numel() * each.itemsize for each in wanted.values()))
     names, loaded = list(wanted), dict[str, Tensor]()
@@ -69,11 +71,14 @@ def _map(path: Path) -> dict[str, Tensor]:
         if path.suffix == '.safetensors':
             return load_file(path)
         state = torch.load(path, map_location='cpu', weights_only=True, mmap=True)
-    except (OSError, SafetensorError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
+    except pickle.UnpicklingError as error:  # torch's own words advise to let the code run
+        raise KfvoError(NOT_TENSORS.format(path)) from error
+    except (OSError, SafetensorError, RuntimeError, EOFError) as error:
         raise KfvoError(f'cannot read the weights in {path}; expected a whole .safetensors file, '
                         f'or a .pt file of nothing but tensors: {reason_of(error)}') from error
-    if not isinstance(state, dict) or not all(isinstance(each, Tensor) for each in state.values()):
-        raise KfvoError(f'{path}: expected tensors by name, as state_dict() gives them')
+    if not isinstance(state, dict) or not all(
+            isinstance(name, str) and isinstance(each, Tensor) for name, each in state.items()):
+        raise KfvoError(NOT_TENSORS.format(path))
     return state
 
 
@@ -85,8 +90,10 @@ def _compare(found: dict[str, Tensor], wanted: dict[str, Tensor]) -> None:
         if found[name].shape != wanted[name].shape:
             wrong.append(f'{name} has the shape {list(found[name].shape)} instead of '
                          f'{list(wanted[name].shape)}')
-        if found[name].dtype not in FLOATS:
-            wrong.append(f'{name} is of {found[name].dtype}, which is no floating point type')
+        if found[name].dtype not in FLOATS or found[name].layout is not torch.strided \
+                or found[name].is_meta:
+            wrong.append(f'{name} is not made of floating point numbers ({found[name].dtype}, '
+                         f'{found[name].layout}, on {found[name].device})')
     if wrong:
         more = f' and {len(wrong) - SHOWN} more' if len(wrong) > SHOWN else ''
         raise KfvoError(f'not the weights of a VGGT model: {", ".join(wrong[:SHOWN])}{more}')

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,6 +21,8 @@ HEAD_SIZE = 64
 """Channels of one attention head of trunk and aggregator."""
 CAMERA_HEADS = 16
 """Attention heads of the camera head, whatever its width."""
+WIDTHS = range(HEAD_SIZE, 8192 + 1, HEAD_SIZE)
+"""What a file may ask for; VGGT-1B has 1024."""
 
 
 @dataclass(frozen=True)
@@ -50,15 +53,18 @@ def config_of(shapes: Mapping[str, tuple[int, ...]]) -> VggtConfig:
     config = VggtConfig(
         width=width, trunk_depth=_blocks(shapes, 'aggregator.patch_embed.blocks'),
         depth=_blocks(shapes, 'aggregator.frame_blocks'),
-        camera_depth=_blocks(shapes, 'camera_head.trunk'), grid=round((positions - 1) ** 0.5))
-    if width % HEAD_SIZE or 2 * width % CAMERA_HEADS or config.depth < 2:
-        raise KfvoError(f'expected a VGGT model of a width that {HEAD_SIZE} divides and of at '
-                        f'least two layers; width {width} and {config.depth} layers came')
+        camera_depth=_blocks(shapes, 'camera_head.trunk'),
+        grid=math.isqrt(max(positions - 1, 0)))
+    if width not in WIDTHS or config.depth < 2 or config.grid < 1:
+        raise KfvoError(
+            f'expected a VGGT model of a width that {HEAD_SIZE} divides, up to {WIDTHS[-1]}, of '
+            f'at least two layers and one position; width {width}, {config.depth} layers and '
+            f'{positions} rows of positions came')
     return config
 
 
 def _blocks(shapes: Mapping[str, tuple[int, ...]], prefix: str) -> int:
-    """Count the blocks of a stack by the highest number among its keys."""
-    numbers = [int(found[1]) for key in shapes
-               if (found := re.match(rf'{re.escape(prefix)}\.(\d+)\.', key))]
-    return max(numbers, default=-1) + 1
+    """Count the blocks of a stack; a number in a file may be of any size."""
+    numbers = {found[1] for key in shapes
+               if (found := re.match(rf'{re.escape(prefix)}\.(\d+)\.', key))}
+    return len(numbers)

@@ -33,9 +33,9 @@ def load_backbone(weights: str, revision: str | None, device: str, precision: st
     path = locate(weights, revision)
     with memory_bounded(place):
         model = load_model(path, place, dtype)
+        if place.type == 'cpu':
+            pack(model)
     logging.getLogger(__name__).info('%s on %s, matrices in %s', path, place, dtype)
-    if place.type == 'cpu':
-        pack(model)
     backbone = VggtBackbone(model, image_width, reuse)
     if place.type == 'cuda':
         warm_up(backbone, window_size)

@@ -11,8 +11,8 @@ import torch
 
 from kfvo_ros.errors import MemoryFullError
 
-CPU_ALLOCATOR = "can't allocate memory"
-"""What torch says where the processor's memory ends; it has no type of its own."""
+NO_MEMORY = ("can't allocate memory", 'could not create a')
+"""What torch and its oneDNN say where the processor's memory ends; it has no type of its own."""
 
 
 @contextmanager
@@ -21,7 +21,7 @@ def memory_bounded(device: torch.device) -> Iterator[None]:
     try:
         yield
     except (torch.OutOfMemoryError, MemoryError, RuntimeError) as error:
-        if type(error) is RuntimeError and CPU_ALLOCATOR not in str(error):
+        if type(error) is RuntimeError and not any(words in str(error) for words in NO_MEMORY):
             raise
         if device.type == 'cuda':
             torch.cuda.empty_cache()

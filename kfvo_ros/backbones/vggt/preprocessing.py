@@ -12,6 +12,9 @@ from PIL import Image
 from kfvo_ros.backbones.vggt.config import PATCH
 from kfvo_ros.errors import KfvoError
 
+MOST_HIGH = 16
+"""What is higher is no picture, and would be made enormous before it is cut."""
+
 
 @dataclass(frozen=True)
 class Fit:
@@ -47,8 +50,11 @@ def fit(native_height: int, native_width: int, width: int) -> Fit:
     """Return how images of one size are brought to `width`, a multiple of PATCH [px].
 
     The height is rounded to whole patches; what is higher than wide is cut to a square. Raises
-    KfvoError when not one row of patches is left.
+    KfvoError when not one row of patches is left, and for what is far higher than wide.
     """
+    if native_height > MOST_HIGH * native_width:
+        raise KfvoError(f'expected images at most {MOST_HIGH} times as high as wide; '
+                        f'{native_width}x{native_height} came')
     height = round(native_height * (width / native_width) / PATCH) * PATCH
     if height == 0:
         raise KfvoError(f'expected images at least {PATCH} pixels high when {width} wide; '

@@ -43,25 +43,26 @@ class Scene:
 
     def slide(self) -> Tensor:
         """Take in a frame and leave the oldest: another frame becomes the anchor."""
-        self._fill()
-        self._window = [*self._window[1:], self._see(self.images[-1:])]
+        self.fill()
+        self._window = [*self._window[1:], *self._see(self.images[-1:])]
         return self._place()
 
     def keep_anchor(self) -> Tensor:
         """Take in a frame in place of the newest, which was dropped."""
-        self._fill()
-        self._window = [*self._window[:-1], self._see(self.images[-1:])]
+        self.fill()
+        self._window = [*self._window[:-1], *self._see(self.images[-1:])]
         return self._place()
 
-    def _fill(self) -> None:
+    def fill(self) -> None:
         """Place a first window, so that every later step finds what it may reuse."""
         if not self._window:
-            self._window = [self._see(image[None]) for image in self.images]
+            self._window = self._see(self.images)
             self._place()
 
-    def _see(self, image: Tensor) -> FrameMemory:
-        patches = self.model.aggregator.see(image)[:, SPECIAL:]
-        return FrameMemory(self._fit, grid_of(image), image[0], patches)
+    def _see(self, images: Tensor) -> list[FrameMemory]:
+        patches = self.model.aggregator.see(images)[:, SPECIAL:]
+        return [FrameMemory(self._fit, grid_of(images), image, each[None])
+                for image, each in zip(images, patches)]
 
     def _place(self) -> Tensor:
         return self.model.camera_head(features_reusing(self.model.aggregator, [self._window]))
@@ -86,7 +87,8 @@ def count_flops(step: Callable[[Scene], Tensor], height: int, width: int, frames
     """Return the floating point operations of a step of the full model; nothing is computed."""
     with torch.device('meta'):
         scene = Scene(Vggt().requires_grad_(False), height, width, frames)
-        scene.keep_anchor()
+        if step is not Scene.plain:
+            scene.fill()
         with FlopCounterMode(display=False) as counter:
             step(scene)
     return counter.get_total_flops()

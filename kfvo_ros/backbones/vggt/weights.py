@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 
@@ -29,9 +30,9 @@ def locate(weights: str, revision: str | None = None) -> Path:
     A repository's file is downloaded once, with a progress bar, at `revision` (branch, tag or
     commit), and found in the cache afterwards, without network too. Raises KfvoError.
     """
-    path = Path(weights).expanduser()
-    if path.suffix in SUFFIXES or path.exists():
-        if not path.is_file():
+    path = Path(os.path.expanduser(weights))  # Path's own raises for users that are unknown
+    if path.suffix in SUFFIXES or os.path.exists(path):
+        if not os.path.isfile(path):
             raise KfvoError(f'there is no file of weights {path}')
         return path
     if not re.fullmatch(r'[\w.-]+/[\w.-]+', weights):
@@ -42,12 +43,12 @@ def locate(weights: str, revision: str | None = None) -> Path:
 
 def _download(repository: str, revision: str | None) -> Path:
     file = FILES.get(repository, DEFAULT_FILE)
-    # The cache first: a robot without network must not wait for the hub's retries.
-    cached = try_to_load_from_cache(repository, file, revision=revision)
-    if isinstance(cached, str):
-        return Path(cached)
     page = f'https://huggingface.co/{repository}'
     try:
+        # The cache first: a robot without network must not wait for the hub's retries.
+        cached = try_to_load_from_cache(repository, file, revision=revision)
+        if isinstance(cached, str):
+            return Path(cached)
         return Path(hf_hub_download(repository, file, revision=revision))
     except GatedRepoError as error:
         raise KfvoError(f'access to {repository} is granted on request: fill in the form on '
@@ -57,6 +58,6 @@ def _download(repository: str, revision: str | None) -> Path:
             f'the weights {repository} are not on this machine and cannot be downloaded: '
             f'connect it to the network once, or copy {file} from {page} here and set weights to '
             'its path, or use the geometric backbone, which needs none') from error
-    except (EntryNotFoundError, HfHubHTTPError, OSError) as error:
+    except (EntryNotFoundError, HfHubHTTPError, OSError, ValueError) as error:
         raise KfvoError(f'cannot download {file} of {repository} (revision {revision}); see '
                         f'{page}: {reason_of(error)}') from error
