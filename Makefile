@@ -75,7 +75,7 @@ $(INSTALLED): setup.py pyproject.toml $(CONSTRAINTS)
 	@touch $@
 
 $(TOOLS): $(INSTALLED)
-	$(PIP_INSTALL) '.[$(ROS)demo,test,vggt]'
+	$(PIP_INSTALL) '.[$(ROS)demo,test,train,vggt]'
 	@touch $@
 
 clean:

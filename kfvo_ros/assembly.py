@@ -14,6 +14,8 @@ from kfvo_ros.camera import read_camera_info
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.keyframes.base import KeyframePolicy
 from kfvo_ros.keyframes.heuristics import Every, OpticalFlow, Survival
+from kfvo_ros.keyframes.learned import Setting
+from kfvo_ros.keyframes.observation import layout_of
 from kfvo_ros.odometry import KeyframeOdometry
 from kfvo_ros.options import OdometryOptions, SequenceOptions, VggtOptions
 from kfvo_ros.sequences import open_sequence
@@ -31,19 +33,34 @@ def make_backbone(options: OdometryOptions, vggt: VggtOptions | None = None) -> 
     return GeometricBackbone(options.seed)
 
 
-def make_policy(options: OdometryOptions) -> KeyframePolicy:
-    """Return the keyframe policy that `options` name."""
+def make_policy(options: OdometryOptions, backbone: Backbone) -> KeyframePolicy:
+    """Return the keyframe policy that `options` name, for this backbone; raises KfvoError."""
     if options.keyframes == 'every':
         return Every()
     if options.keyframes == 'optical_flow':
         return OpticalFlow(options.flow_threshold)
-    return Survival(options.survival_share)
+    if options.keyframes == 'survival':
+        return Survival(options.survival_share)
+    if options.policy is None:
+        raise KfvoError('the policy of learned keyframes is a file: expected one in policy, none '
+                        'came')
+    from kfvo_ros.keyframes.policy_file import read_policy
+    return read_policy(Path(options.policy).expanduser()).policy(setting_of(options, backbone))
+
+
+def setting_of(options: OdometryOptions, backbone: Backbone) -> Setting:
+    """Return what a learned policy must fit."""
+    return Setting(backbone.name, options.scale_rule or backbone.default_scale_rule,
+                   options.window_size,
+                   layout_of(backbone.descriptor_size, options.window_size,
+                             backbone.signal_names))
 
 
 def make_odometry(options: OdometryOptions, backbone: Backbone | None = None) -> KeyframeOdometry:
     """Return the odometry that `options` describe, with a backbone that is there already."""
-    return KeyframeOdometry(backbone or make_backbone(options), make_policy(options),
-                            options.scale_rule, options.window_size)
+    backbone = backbone or make_backbone(options)
+    return KeyframeOdometry(backbone, make_policy(options, backbone), options.scale_rule,
+                            options.window_size)
 
 
 def make_sequence(text: str, options: SequenceOptions) -> Sequence:

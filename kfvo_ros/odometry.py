@@ -129,11 +129,14 @@ class KeyframeOdometry:
             keep = decision if isinstance(decision, bool) else self.policy.decide(decision)
         return self.commit(keep, clock.durations)
 
-    def begin(self, frame: Frame) -> Window | None:
-        """Encode the frame (step 1); return its window, None when there is nothing before it."""
+    def begin(self, frame: Frame, encoded: Encoded | None = None) -> Window | None:
+        """Encode the frame (step 1); return its window, None when there is nothing before it.
+
+        A frame that was encoded before need not be again.
+        """
         if self._stream is None:
             self._stream = self.backbone.open(frame.camera)
-        encoded = self._stream.encode(frame)
+        encoded = encoded or self._stream.encode(frame)
         self._newest = Keyframe(encoded, self._track(frame, encoded), self._frames_seen,
                                 self._known.T_world_latest, self._known.covariance)
         self._frames_seen += 1
@@ -142,7 +145,7 @@ class KeyframeOdometry:
         if not self._keyframes:
             return None
         self._previous = self._known.seen_from(self._keyframes)
-        return Window(self._stream, tuple(k.encoded for k in (*self._keyframes, self._newest)),
+        return Window(self._stream, tuple(frame.encoded for frame in self.window),
                       self._previous)
 
     def integrate(self, estimate: Estimate | None) -> DecisionInput | bool:
@@ -205,6 +208,11 @@ class KeyframeOdometry:
         return final
 
     @property
+    def window(self) -> tuple[Keyframe, ...]:
+        """The keyframes, oldest first, and the newest frame."""
+        return (*self._keyframes, self._newest)
+
+    @property
     def pending(self) -> tuple[Placed, ...]:
         """Frames whose poses may still change, in input order."""
         return tuple(self._pending)
@@ -227,7 +235,7 @@ class KeyframeOdometry:
 
     def _doubt(self, estimate: Estimate, scale: float) -> None:
         """Give the newest frame, and the anchor to come, their covariances in the world."""
-        anchor, frames = self._keyframes[0], (*self._keyframes, self._newest)
+        anchor, frames = self._keyframes[0], self.window
         for index in (-1,) if estimate.status is Status.LOST else (1, -1):
             own = turned(estimate.covariance[index], anchor.T_world_camera, scale)
             offset = frames[index].T_world_camera[:3, 3] - anchor.T_world_camera[:3, 3]
@@ -236,8 +244,7 @@ class KeyframeOdometry:
 
     def _decision(self, estimate: Estimate) -> DecisionInput:
         """Step 5: what the policy sees."""
-        frames = (*self._keyframes, self._newest)
-        last = self._keyframes[-1]
+        frames, last = self.window, self._keyframes[-1]
         observation = observe([frame.encoded.descriptor for frame in frames],
                               np.stack([frame.T_world_camera for frame in frames]),
                               estimate.signals)

@@ -8,11 +8,12 @@ from kfvo_ros.errors import KfvoError, reason_of
 
 PIP_NAMES = {'cv2': 'opencv-python-headless', 'mcap': 'mcap', 'numba': 'numba',
              'numpy': 'numpy', 'poselib': 'poselib', 'rosbags': 'rosbags',
-             'threadpoolctl': 'threadpoolctl', 'tqdm': 'tqdm', 'yaml': 'PyYAML'}
+             'safetensors': 'safetensors', 'threadpoolctl': 'threadpoolctl', 'tqdm': 'tqdm',
+             'yaml': 'PyYAML'}
 """The modules of setup.py's install_requires, by the name they are imported under."""
 
 OPTIONAL_PIP_NAMES = {'matplotlib': 'matplotlib', 'torch': 'torch', 'PIL': 'pillow',
-                      'safetensors': 'safetensors', 'huggingface_hub': 'huggingface-hub'}
+                      'huggingface_hub': 'huggingface-hub'}
 """Modules that one command needs: an extra of setup.py brings them."""
 
 ROS_MODULES = frozenset(('rclpy', 'rcl_interfaces', 'rosgraph_msgs', 'sensor_msgs', 'nav_msgs',

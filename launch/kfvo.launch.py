@@ -18,7 +18,7 @@ SHARE = Path(__file__).resolve().parent.parent
 PARAMETERS = {
     'image_topic': 'images to follow; ends in /compressed for CompressedImage',
     'camera_info_file': 'calibration (camera_info.yaml) that wins over the CameraInfo topic',
-    'keyframes': 'keyframe policy: every, optical_flow or survival',
+    'keyframes': 'keyframe policy: every, optical_flow, survival or learned',
     'backbone': 'model: geometric, or vggt on a GPU',
     'weights': 'weights of vggt: a repository on the hub, or a file',
     'base_frame': 'frame whose pose is given, such as base_link',

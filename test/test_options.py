@@ -17,6 +17,7 @@ from kfvo_ros.options import (
     OdometryOptions,
     PlayOptions,
     SequenceOptions,
+    VggtOptions,
     add_arguments,
     from_arguments,
 )
@@ -24,8 +25,10 @@ from kfvo_ros.scale import SCALE_RULES
 
 OTHER = {
     OdometryOptions: OdometryOptions(scale_rule='translation', keyframes='optical_flow',
-                                     flow_threshold=12.5, survival_share=0.25, window_size=5,
-                                     seed=17),
+                                     backbone='vggt', flow_threshold=12.5, survival_share=0.25,
+                                     policy='a policy.safetensors', window_size=5, seed=17),
+    VggtOptions: VggtOptions(weights='model.pt', revision='v1', device='cuda:1', precision='fp16',
+                             image_width=140, recompute=True),
     SequenceOptions: SequenceOptions(kind='tum', camera='a b.yaml', image_topic='/cam0/image',
                                      ground_truth_topic='/vicon',
                                      ground_truth_to_camera='0 0 0 0 0 0 1', rate=29.97, stop=3),
@@ -42,19 +45,20 @@ def flag_of(field):
     return f'--{(field.metadata["flag"] or field.name).replace("_", "-")}'
 
 
-@pytest.mark.parametrize('options', [OdometryOptions, SequenceOptions])
+@pytest.mark.parametrize('options', list(OTHER))
 def test_no_arguments_are_the_defaults(options):
     assert parse(options) == options()
 
 
-@pytest.mark.parametrize('options', [OdometryOptions, SequenceOptions])
+@pytest.mark.parametrize('options', list(OTHER))
 def test_every_field_goes_through_the_command_line(options):
     wanted = OTHER[options]
     different = [name for name, value in asdict(wanted).items()
                  if value != getattr(options(), name)]
-    assert set(different) >= {field.name for field in fields(options)} - {'backbone'}
-    arguments = [text for field in fields(options)
-                 for text in (flag_of(field), str(getattr(wanted, field.name)))]
+    assert set(different) == {field.name for field in fields(options)}
+    arguments = [text for field in fields(options) for text in (
+        [flag_of(field)] if getattr(wanted, field.name) is True
+        else [flag_of(field), str(getattr(wanted, field.name))])]
     parsed = parse(options, *arguments)
     assert parsed == wanted
     assert [type(value) for value in asdict(parsed).values()] == [
@@ -117,10 +121,10 @@ def test_range_ends_are_allowed():
 
 def test_help_describes_each_option():
     parser = argparse.ArgumentParser()
-    for options in (OdometryOptions, SequenceOptions):
+    for options in OTHER:
         add_arguments(parser, options)
     text = ' '.join(parser.format_help().split())
-    for declared in (*fields(OdometryOptions), *fields(SequenceOptions)):
+    for declared in (field for options in OTHER for field in fields(options)):
         assert flag_of(declared) in text
         assert ' '.join(declared.metadata['description'].split()) in text
     assert '(default: 0.8)' in text
@@ -132,7 +136,7 @@ def test_options_cannot_be_changed():
         OdometryOptions().seed = 1
 
 
-@pytest.mark.parametrize('keyframes', POLICIES)
+@pytest.mark.parametrize('keyframes', [name for name in POLICIES if name != 'learned'])
 def test_odometry_is_what_the_options_say(keyframes):
     odometry = assembly.make_odometry(OdometryOptions(
         keyframes=keyframes, flow_threshold=12.5, survival_share=0.25, window_size=5,

@@ -35,7 +35,8 @@ BUILT = ('.git', '.venv*', '*.egg-info', '__pycache__', '.*_cache', 'build', 'in
 
 # Rooms by floor, the ground first; modules that are not named stand on the ground.
 FLOORS = ((), ('sequences',), ('backbones',), ('keyframes',), ('knowledge', 'odometry', 'scale'),
-          ('assembly', 'body', 'live', 'options', 'plots', 'recording', 'results'), ('ros',),
+          ('assembly', 'body', 'live', 'options', 'plots', 'recording', 'results'),
+          ('learning', 'ros'),
           ('rehearsal',),
           ('convert', 'demo', 'node', 'node_benchmark', 'play', 'run'))
 HEAVY = ('rclpy', 'torch', 'scipy', 'stable_baselines3')

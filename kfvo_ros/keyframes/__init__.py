@@ -2,5 +2,5 @@
 # SPDX-License-Identifier: Apache-2.0
 """Keyframe policies: which frames stay in the window."""
 
-POLICIES = ('every', 'optical_flow', 'survival')
+POLICIES = ('every', 'optical_flow', 'survival', 'learned')
 """Names of the policies, as options and results have them."""

@@ -10,6 +10,10 @@ import numpy as np
 
 from kfvo_ros import geometry
 
+POSE_SIZE = 7
+Layout = tuple[tuple[str, int], ...]
+"""Names of the parts of an observation and how many numbers each has, in order."""
+
 
 def observe(descriptors: Sequence[np.ndarray], T_w_frame: np.ndarray,
             signals: np.ndarray) -> np.ndarray:
@@ -24,3 +28,19 @@ def observe(descriptors: Sequence[np.ndarray], T_w_frame: np.ndarray,
     poses = np.concatenate([T_newest_keyframe[:, :3, 3], quat_xyzw], axis=1)
     return np.concatenate([np.mean(descriptors, axis=0), poses.ravel(),
                            signals]).astype(np.float32)
+
+
+def layout_of(descriptor_size: int, window_size: int, signal_names: Sequence[str]) -> Layout:
+    """Return the parts of what `observe` returns."""
+    return (('descriptor', descriptor_size), ('poses', POSE_SIZE * (window_size - 1)),
+            *((name, 1) for name in signal_names))
+
+
+def indices_of(parts: Layout, layout: Layout) -> np.ndarray:
+    """Return where the numbers of `parts` are in observations of `layout`.
+
+    Raises KeyError naming a part that is not in there, in this size.
+    """
+    ends = np.cumsum([size for _, size in layout])
+    places = {part: np.arange(end - part[1], end) for part, end in zip(layout, ends)}
+    return np.concatenate([places[part] for part in parts])

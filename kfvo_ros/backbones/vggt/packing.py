@@ -40,7 +40,8 @@ def pack(model: Vggt) -> Vggt:
     except (AttributeError, RuntimeError) as error:
         logging.getLogger(__name__).info('weights are not packed: %s', error)
         return model
-    for module in list(model.modules()):
+    # No list of the matrices themselves: it would keep every one that was laid out anew.
+    for module in [each for each in model.modules() if not isinstance(each, Linear)]:
         for name, child in module.named_children():
             if isinstance(child, Linear) and child is not last.attn.qkv:  # used in parts
                 setattr(module, name, PackedLinear(child))

@@ -1,0 +1,73 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Actor and critic as two networks that share nothing; the critic alone sees the truth."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from torch import Tensor, nn
+
+from kfvo_ros.learning.environment import OBSERVATION, PRIVILEGED
+
+WIDTH = 256
+
+
+class SideBySide(BaseFeaturesExtractor):
+    """The observation, and behind it what is privileged, as they are."""
+
+    def __init__(self, observation_space: spaces.Dict) -> None:
+        super().__init__(observation_space, sum(_sizes(observation_space)))
+
+    def forward(self, observations: dict[str, Tensor]) -> Tensor:
+        """Return (B, both sizes)."""
+        return torch.cat([observations[OBSERVATION], observations[PRIVILEGED]], dim=1)
+
+
+class TwoNetworks(nn.Module):
+    """Two ReLU networks of two layers each; the last layer of either is the policy's own."""
+
+    latent_dim_pi = latent_dim_vf = WIDTH
+
+    def __init__(self, observed: int, privileged: int) -> None:
+        super().__init__()
+        self.observed = observed
+        self.actor = _layers(observed)
+        self.critic = _layers(observed + privileged)
+
+    def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the last hidden layers of both, (B, WIDTH)."""
+        return self.forward_actor(features), self.forward_critic(features)
+
+    def forward_actor(self, features: Tensor) -> Tensor:
+        """Return the actor's last hidden layer; it reads the observation only."""
+        return self.actor(features[:, :self.observed])
+
+    def forward_critic(self, features: Tensor) -> Tensor:
+        """Return the critic's last hidden layer."""
+        return self.critic(features)
+
+
+class PrivilegedCritic(ActorCriticPolicy):
+    """For `PPO(PrivilegedCritic, environment)`. Source: the paper, sections IV-C and IV-E."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options | {'features_extractor_class': SideBySide})
+
+    def _build_mlp_extractor(self) -> None:
+        assert isinstance(self.observation_space, spaces.Dict)
+        observed, privileged = _sizes(self.observation_space)
+        self.mlp_extractor = TwoNetworks(observed, privileged)  # type: ignore[assignment]
+
+
+def _sizes(space: spaces.Dict) -> list[int]:
+    """Return how many numbers are observed, and how many privileged."""
+    return [spaces.flatdim(space[name]) for name in (OBSERVATION, PRIVILEGED)]
+
+
+def _layers(size: int) -> nn.Sequential:
+    return nn.Sequential(nn.Linear(size, WIDTH), nn.ReLU(), nn.Linear(WIDTH, WIDTH), nn.ReLU())

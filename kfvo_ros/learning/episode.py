@@ -1,0 +1,103 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""One sequence as a Markov decision process: keep the frame, or drop it (paper, section IV-A)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from kfvo_ros import geometry
+from kfvo_ros.backbones.base import Backbone, Estimate, Window
+from kfvo_ros.keyframes.base import DecisionInput
+from kfvo_ros.keyframes.heuristics import Every
+from kfvo_ros.keyframes.rail import Rail
+from kfvo_ros.learning.drives import Drive
+from kfvo_ros.learning.reward import ALIGNED, align
+from kfvo_ros.odometry import KeyframeOdometry
+
+AHEAD = 2
+"""So many true motions to come are told to the critic."""
+POSE = 7
+PRIVILEGED_SIZE = (1 + AHEAD) * POSE + 1
+
+
+Reward = Callable[[np.ndarray, np.ndarray, bool], float]
+"""What a decision on a window of estimated and true poses (S, 4, 4) is worth."""
+
+
+class Episode:
+    """Drives through a sequence, and stops where there is something to decide.
+
+    ``decision`` is what the policy sees there, None before the first one and once it ``ended``:
+    at the last frame, or when the camera is lost. Where the rail decides nobody is asked, and
+    before the first question nothing is earned. The caller runs the backbone: `enter`, estimate
+    the window, `leave`, until there is a decision.
+    """
+
+    def __init__(self, drive: Drive, backbone: Backbone, scale_rule: str, window_size: int,
+                 rail: Rail, reward: Reward) -> None:
+        self._drive, self._rail, self._reward = drive, rail, reward
+        self._odometry = KeyframeOdometry(backbone, Every(), scale_rule, window_size)
+        self._next = 0
+        self.decision: DecisionInput | None = None
+        self.ended = False
+        self._asked = False
+        self._earned = 0.0
+
+    def enter(self) -> Window | None:
+        """Take in the next frame; return the window to estimate, None for the very first."""
+        index, self._next = self._next, self._next + 1
+        return self._odometry.begin(self._drive.frames[index], self._drive.encoded[index])
+
+    def leave(self, estimate: Estimate | None) -> None:
+        """Go on to a decision where there is one, else decide as the odometry or the rail does."""
+        decision = self._odometry.integrate(estimate)
+        if isinstance(decision, bool):
+            self._odometry.commit(decision, {})
+            self.ended = not decision or self._next == len(self._drive)
+            return
+        forced = self._rail.forced(decision)
+        if forced is None:
+            self.decision, self._asked = decision, True
+        else:
+            self.decide(forced)
+
+    def decide(self, keep: bool) -> None:
+        """Keep or drop the frame, and earn what that is worth."""
+        worth = self._reward(*self._window(), keep)
+        self._earned += worth if self._asked else 0.0
+        self._odometry.commit(keep, {})
+        self.decision = None
+        self.ended = self._next == len(self._drive)
+
+    def take_reward(self) -> float:
+        """Return what was earned since it was taken last: a decision's worth, and the rail's."""
+        earned, self._earned = self._earned, 0.0
+        return earned
+
+    def privileged(self) -> np.ndarray:
+        """Return what only the critic sees (PRIVILEGED_SIZE,): the true motion, and the next.
+
+        From the last keyframe to the newest frame, then frame by frame, in the trajectory's unit,
+        each (t, quat_xyzw); past the end zeros, and a flag of 1.
+        """
+        estimated, true = self._window()
+        scale = align(estimated[:ALIGNED], true[:ALIGNED], 1.0).scale
+        ahead = self._drive.T_truth_camera[self._next - 1:self._next + AHEAD]
+        motions = [geometry.relative(true[-1], true[-2]),
+                   *(geometry.relative(a, b) for a, b in zip(ahead, ahead[1:]))]
+        told = np.zeros(PRIVILEGED_SIZE, dtype=np.float32)
+        for number, motion in enumerate(motions):
+            told[number * POSE:(number + 1) * POSE] = np.concatenate([
+                motion[:3, 3] / max(scale, 1e-9),
+                geometry.quat_xyzw_from_rotation(motion[:3, :3])])
+        told[-1] = len(motions) < 1 + AHEAD
+        return told
+
+    def _window(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return estimated and true poses (S, 4, 4) of the frames in the window."""
+        window = self._odometry.window
+        return (np.stack([frame.T_world_camera for frame in window]),
+                self._drive.T_truth_camera[[frame.index for frame in window]])

@@ -1,0 +1,182 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Keyframe selection as an environment of stable-baselines3, on rendered sequences."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import repeat
+
+import numpy as np
+import pytest
+
+pytest.importorskip('stable_baselines3', reason="stable-baselines3 is not installed: pip install "
+                    "'.[train]'")
+
+from kfvo_ros import geometry
+from kfvo_ros.backbones.base import Status
+from kfvo_ros.backbones.geometric.backbone import GeometricBackbone
+from kfvo_ros.errors import KfvoError
+from kfvo_ros.keyframes.base import KeyframePolicy
+from kfvo_ros.keyframes.rail import Rail
+from kfvo_ros.learning.drives import Drive, record
+from kfvo_ros.learning.environment import OBSERVATION, PRIVILEGED, KeyframeEnvironment
+from kfvo_ros.learning.episode import PRIVILEGED_SIZE, Episode
+from kfvo_ros.learning.reward import PaperReward
+from kfvo_ros.odometry import KeyframeOdometry
+from kfvo_ros.sequences.synthetic import SyntheticSequence
+
+FRAMES = 30
+NO_RAIL = Rail(min_survival=0.0, max_gap=10 ** 6, min_flow=0.0)
+SIZE = 48 + 7 * 7 + 8
+
+
+@pytest.fixture(scope='module')
+def backbone() -> GeometricBackbone:
+    return GeometricBackbone()
+
+
+@pytest.fixture(scope='module')
+def drives(backbone) -> list[Drive]:
+    return [record(SyntheticSequence(seed, 'smooth', FRAMES), backbone) for seed in (3, 4)]
+
+
+def begin(drive: Drive, backbone: GeometricBackbone, rail: Rail = NO_RAIL) -> Episode:
+    return Episode(drive, backbone, 'depth', 8, rail, PaperReward())
+
+
+def again(drive: Drive, backbone: GeometricBackbone, rail: Rail = NO_RAIL) -> Iterator[Episode]:
+    return (begin(drive, backbone, rail) for _ in repeat(None))
+
+
+class Counting(GeometricBackbone):
+    """Counts its calls, and the windows in them."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.calls: list[int] = []
+
+    def estimate(self, windows):
+        self.calls.append(len(windows))
+        return super().estimate(windows)
+
+
+class Scripted(KeyframePolicy):
+    """Decides as it is told, and remembers what it saw."""
+
+    name = 'scripted'
+
+    def __init__(self, answers) -> None:
+        self.answers, self.seen = iter(answers), []
+
+    def decide(self, decision):
+        self.seen.append(decision.observation)
+        return next(self.answers)
+
+
+def test_an_environment_sees_what_a_running_policy_sees(backbone, drives):
+    answers = np.random.default_rng(0).integers(0, 2, FRAMES).astype(bool)
+    policy = Scripted(answers)
+    odometry = KeyframeOdometry(backbone, policy, 'depth')
+    updates = [odometry.process(frame) for frame in SyntheticSequence(3, 'smooth', FRAMES)]
+    assert all(update.status is not Status.LOST for update in updates)
+
+    environment = KeyframeEnvironment(backbone, [again(drives[0], backbone)], SIZE)
+    seen = [environment.reset()[OBSERVATION][0]]
+    for number in range(FRAMES - 8):
+        observations, _, dones, _ = environment.step(answers[number:number + 1])
+        assert not dones[0]
+        seen.append(observations[OBSERVATION][0])
+    np.testing.assert_array_equal(seen, policy.seen)
+
+
+def test_two_sequences_take_one_call_per_step(drives):
+    backbone = Counting()
+    environment = KeyframeEnvironment(
+        backbone, [again(drive, backbone) for drive in drives], SIZE)
+    environment.reset()
+    backbone.calls.clear()
+    for _ in range(5):
+        observations, rewards, dones, _ = environment.step(np.array([1, 0]))
+        assert observations[OBSERVATION].shape == (2, SIZE) and rewards.shape == (2,)
+        assert observations[PRIVILEGED].shape == (2, PRIVILEGED_SIZE) and not dones.any()
+    assert backbone.calls == [2] * 5
+
+
+def test_the_end_begins_the_next_episode_and_tells_the_last_observation(backbone, drives):
+    environment = KeyframeEnvironment(backbone, [again(drives[0], backbone)], SIZE)
+    first = environment.reset()[OBSERVATION][0]
+    decisions = FRAMES - 7
+    for _ in range(decisions - 1):
+        last, _, dones, infos = environment.step(np.array([1]))
+        assert not dones[0] and not infos[0]
+    observations, rewards, dones, infos = environment.step(np.array([1]))
+    assert dones[0] and rewards[0] != 0.0
+    np.testing.assert_array_equal(observations[OBSERVATION][0], first)
+    np.testing.assert_array_equal(infos[0]['terminal_observation'][OBSERVATION],
+                                  last[OBSERVATION][0])
+
+
+def test_the_critic_is_told_true_motions_in_the_trajectory_s_unit(backbone, drives):
+    environment = KeyframeEnvironment(backbone, [again(drives[0], backbone)], SIZE)
+    told = environment.reset()[PRIVILEGED][0]
+    truth = drives[0].T_truth_camera
+    true_motions = [geometry.relative(truth[7], truth[6]), geometry.relative(truth[7], truth[8]),
+                    geometry.relative(truth[8], truth[9])]
+    motions = [geometry.transform_from_xyz_quat(told[at:at + 7].astype(float))
+               for at in (0, 7, 14)]
+    scales = [np.linalg.norm(true[:3, 3]) / np.linalg.norm(motion[:3, 3])
+              for true, motion in zip(true_motions, motions)]
+    assert np.ptp(scales) < 1e-4 * scales[0]  # metres per unit of the trajectory
+    for true, motion in zip(true_motions, motions):
+        np.testing.assert_allclose(motion[:3, :3], true[:3, :3], atol=1e-6)
+    assert told[-1] == 0.0
+    for _ in range(FRAMES - 8):
+        observations, *_ = environment.step(np.array([0]))
+    end = observations[PRIVILEGED][0]
+    assert end[-1] == 1.0 and not end[7:21].any() and end[:7].any()
+
+
+def test_where_the_rail_decides_nobody_is_asked(backbone, drives):
+    always = Rail(min_survival=0.0, max_gap=3, min_flow=0.0)
+    environment = KeyframeEnvironment(backbone, [again(drives[0], backbone, always)], SIZE)
+    environment.reset()
+    asked = 1
+    while True:
+        _, _, dones, _ = environment.step(np.array([0]))
+        if dones[0]:
+            break
+        asked += 1
+    # Of three frames in a row the policy drops two, and the rail keeps the third.
+    assert asked == pytest.approx((FRAMES - 7) * 2 / 3, abs=1.0)
+
+
+def test_lost_and_unanswered_episodes_never_reach_the_rollout(backbone, drives):
+    short = Drive('short', drives[0].frames[:5], drives[0].encoded[:5],
+                  drives[0].T_truth_camera[:5])
+    sources = iter([begin(short, backbone), begin(short, backbone), begin(drives[1], backbone)])
+    environment = KeyframeEnvironment(backbone, [sources], SIZE)
+    seen = environment.reset()[OBSERVATION][0]
+    alone = KeyframeEnvironment(backbone, [again(drives[1], backbone)], SIZE)
+    np.testing.assert_array_equal(seen, alone.reset()[OBSERVATION][0])
+
+
+def test_a_sequence_without_truth_of_the_camera_is_refused(backbone):
+    class Blind(SyntheticSequence):
+        def ground_truth(self):
+            return None
+
+    with pytest.raises(KfvoError, match='expected ground truth of the camera'):
+        record(Blind(3, 'smooth', 3), backbone)
+
+
+def test_stable_baselines_learns_in_it(drives):
+    from stable_baselines3 import PPO
+    backbone = GeometricBackbone()
+    environment = KeyframeEnvironment(
+        backbone, [again(drive, backbone) for drive in drives], SIZE)
+    model = PPO('MultiInputPolicy', environment, n_steps=16, batch_size=16, n_epochs=1, seed=0,
+                device='cpu')
+    before = model.policy.action_net.weight.detach().clone()
+    model.learn(32)
+    assert (model.policy.action_net.weight != before).any()

@@ -1,0 +1,181 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The learned policy: its network, its rail, its file, and where it may run."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from safetensors.numpy import load_file, save_file
+
+from kfvo_ros import assembly
+from kfvo_ros.errors import KfvoError
+from kfvo_ros.keyframes.base import DecisionInput
+from kfvo_ros.keyframes.learned import CLIP, Actor, Layer, Learned, Setting
+from kfvo_ros.keyframes.observation import indices_of, layout_of
+from kfvo_ros.keyframes.policy_file import KEY, PolicyFile, read_policy
+from kfvo_ros.keyframes.rail import Rail
+from kfvo_ros.options import OdometryOptions, VggtOptions
+from kfvo_ros.sequences.synthetic import SyntheticSequence
+from kfvo_ros.tracking import Tracks
+
+LAYOUT = layout_of(48, 8, ('near', 'far'))
+SIZE = 48 + 49 + 2
+SETTING = Setting('geometric', 'depth', 8, LAYOUT)
+NO_RAIL = Rail(min_survival=0.0, max_gap=10 ** 6, min_flow=0.0)
+
+
+def actor(size: int = SIZE, seed: int = 0) -> Actor:
+    random = np.random.default_rng(seed)
+    sizes = [size, 256, 256, 2]
+    return Actor(random.normal(size=size).astype(np.float32),
+                 random.uniform(0.5, 2.0, size).astype(np.float32),
+                 tuple(Layer(random.normal(0.0, last ** -0.5, (out, last)).astype(np.float32),
+                             random.normal(size=out).astype(np.float32))
+                       for last, out in zip(sizes, sizes[1:])))
+
+
+def decision(observation: np.ndarray, survivors: int = 80, flow: float = 10.0,
+             gap: int = 1) -> DecisionInput:
+    pixels = np.random.default_rng(3).uniform(50.0, 400.0, (100, 2))
+    return DecisionInput(observation, Tracks(np.arange(100), pixels),
+                         Tracks(np.arange(survivors), pixels[:survivors] + [flow, 0.0]), gap)
+
+
+def test_the_network_is_the_one_that_torch_runs():
+    torch = pytest.importorskip('torch', reason="torch is not installed: pip install torch")
+    numbers = actor()
+    steps = [torch.nn.Linear(len(layer.weight[0]), len(layer.bias)) for layer in numbers.layers]
+    for step, layer in zip(steps, numbers.layers):
+        step.weight.data, step.bias.data = map(torch.tensor, (layer.weight, layer.bias))
+    network = torch.nn.Sequential(steps[0], torch.nn.ReLU(), steps[1], torch.nn.ReLU(), steps[2])
+    seen = np.random.default_rng(1).normal(0.0, 8.0, (1000, SIZE)).astype(np.float32)
+    standard = ((torch.tensor(seen) - torch.tensor(numbers.mean)) / torch.tensor(numbers.std))
+    expected = network(standard.clamp(-CLIP, CLIP)).detach().numpy()
+    assert np.abs(numbers.logits(seen) - expected).max() < 1e-5 * np.abs(expected).max()
+    assert (np.abs(standard.numpy()) > CLIP).any()
+
+
+def test_a_tie_keeps_and_the_greater_preference_decides():
+    dead = Layer(np.zeros((2, SIZE), np.float32), np.zeros(2, np.float32))
+    blank = Actor(np.zeros(SIZE, np.float32), np.ones(SIZE, np.float32), (dead,))
+    everything = np.arange(SIZE)
+    observation = np.ones(SIZE, np.float32)
+    assert Learned(blank, NO_RAIL, everything).decide(decision(observation))
+    for bias, keeps in (([0.1, 0.0], False), ([0.0, 0.1], True)):
+        biased = replace(blank, layers=(replace(dead, bias=np.array(bias, np.float32)),))
+        assert Learned(biased, NO_RAIL, everything).decide(decision(observation)) is keeps
+
+
+def test_a_policy_sees_only_its_own_parts():
+    parts = (('far', 1), ('descriptor', 48))
+    indices = indices_of(parts, LAYOUT)
+    observation = np.arange(SIZE, dtype=np.float32)
+    assert observation[indices].tolist() == [98.0, *range(48)]
+    with pytest.raises(KeyError):
+        indices_of((('descriptor', 1024),), LAYOUT)
+
+
+@pytest.mark.parametrize(('change', 'forced'), [
+    ({}, None), ({'survivors': 49}, True), ({'survivors': 51}, None), ({'survivors': 0}, True),
+    ({'gap': 40}, True), ({'gap': 39}, None), ({'flow': 1.9}, False), ({'flow': 2.1}, None),
+    ({'flow': 1.9, 'survivors': 49}, True), ({'flow': 0.0, 'gap': 40}, True)])
+def test_the_rail_decides_at_the_extremes_alone(change, forced):
+    assert Rail().forced(decision(np.zeros(SIZE), **change)) is forced
+
+
+def test_without_tracks_the_rail_knows_the_gap_only():
+    bare = DecisionInput(np.zeros(SIZE), Tracks(), Tracks(), 39)
+    assert Rail().forced(bare) is None
+    assert Rail().forced(replace(bare, gap=40)) is True
+
+
+def test_a_file_holds_all_of_a_policy(tmp_path: Path):
+    written = PolicyFile(actor(), Rail(0.4, 30, 1.5), SETTING, {'steps': 5, 'seed': 1})
+    written.write(tmp_path / 'policy.safetensors')
+    read = read_policy(tmp_path / 'policy.safetensors')
+    assert (read.rail, read.setting, read.training) == (
+        written.rail, written.setting, written.training)
+    seen = np.random.default_rng(2).normal(size=(20, SIZE)).astype(np.float32)
+    np.testing.assert_array_equal(read.actor.logits(seen), written.actor.logits(seen))
+
+
+@pytest.mark.parametrize(('change', 'words'), [
+    ({'backbone': 'vggt'}, ('geometric', 'vggt')), ({'scale_rule': 'none'}, ('depth', 'none')),
+    ({'window_size': 6}, ('8', '6')), ({'observation': LAYOUT[:-1]}, ('far',))])
+def test_another_setting_is_refused_with_both_named(change, words):
+    with pytest.raises(KfvoError) as refusal:
+        PolicyFile(actor(), Rail(), SETTING).policy(replace(SETTING, **change))
+    assert all(word in str(refusal.value) for word in words)
+
+
+def damage(path: Path, how: str) -> None:
+    """Make a policy file a bad one."""
+    PolicyFile(actor(), Rail(), SETTING).write(path)
+    tensors, head = load_file(path), {'format_version': 1}
+    good = PolicyFile(actor(), Rail(), SETTING)
+    if how == 'cut':
+        path.write_bytes(path.read_bytes()[:1000])
+    elif how == 'text':
+        path.write_text('a policy')
+    elif how == 'other tensors':
+        save_file(tensors, path)
+    elif how == 'half a head':
+        save_file(tensors, path, {KEY: json.dumps(head)})
+    elif how == 'no json':
+        save_file(tensors, path, {KEY: '{'})
+    elif how == 'later version':
+        save_file(tensors, path, {KEY: json.dumps({'format_version': 2})})
+    elif how == 'not finite':
+        replace(good, actor=replace(good.actor, mean=np.full(SIZE, np.nan))).write(path)
+    elif how == 'no spread':
+        replace(good, actor=replace(good.actor, std=np.zeros(SIZE))).write(path)
+    elif how == 'wrong size':
+        replace(good, actor=actor(SIZE + 1)).write(path)
+    elif how == 'no layers':
+        replace(good, actor=replace(good.actor, layers=())).write(path)
+
+
+@pytest.mark.parametrize('how', [
+    'cut', 'text', 'other tensors', 'half a head', 'no json', 'later version', 'not finite',
+    'no spread', 'wrong size', 'no layers'])
+def test_a_bad_file_is_one_clear_line(how, tmp_path: Path):
+    path = tmp_path / 'policy.safetensors'
+    damage(path, how)
+    with pytest.raises(KfvoError) as refusal:
+        read_policy(path)
+    assert str(path) in str(refusal.value) and '\n' not in str(refusal.value)
+    assert 'expected a policy that kfvo_train wrote' in str(refusal.value)
+
+
+def test_missing_files_and_folders_are_named(tmp_path: Path):
+    with pytest.raises(KfvoError, match='missing.safetensors'):
+        read_policy(tmp_path / 'missing.safetensors')
+    with pytest.raises(KfvoError, match='cannot write the policy'):
+        PolicyFile(actor(), Rail(), SETTING).write(tmp_path / 'nowhere' / 'policy.safetensors')
+
+
+def test_a_policy_runs_with_the_backbone_it_was_trained_with(tmp_path: Path):
+    path = tmp_path / 'policy.safetensors'
+    options = OdometryOptions(keyframes='learned', policy=str(path))
+    with pytest.raises(KfvoError, match='none came'):
+        assembly.make_odometry(replace(options, policy=None))
+    setting = assembly.setting_of(options, assembly.make_backbone(options, VggtOptions()))
+    size = sum(size for _, size in setting.observation)
+    kept = []
+    for bias in ([-1e6, 1e6], [1e6, -1e6]):  # always keep, and always drop but for the rail
+        numbers = actor(size)
+        last = replace(numbers.layers[-1], bias=np.array(bias, np.float32))
+        PolicyFile(replace(numbers, layers=(*numbers.layers[:-1], last)), Rail(),
+                   setting).write(path)
+        odometry = assembly.make_odometry(options)
+        kept.append(sum(odometry.process(frame).is_keyframe
+                        for frame in SyntheticSequence(3, 'smooth', 40)))
+    assert odometry.policy.name == 'learned'
+    assert kept[0] == 40 and 7 < kept[1] < 20
+    with pytest.raises(KfvoError, match='window_size'):
+        assembly.make_odometry(replace(options, window_size=6))
