@@ -37,7 +37,7 @@ class Role(IntEnum):
 class FirstLayer(NamedTuple):
     """The part of the first pair of blocks that knows one frame and its role only.
 
-    ``tokens`` (..., P, width) after the frame block; ``q``, ``k``, ``v`` (..., heads, P,
+    ``tokens`` (..., P, width) after the frame block; ``q``, ``k``, ``v`` (..., P, heads,
     HEAD_SIZE) of the global block. Behind it nothing is a frame's own any more.
     """
 
@@ -95,9 +95,7 @@ class Aggregator(nn.Module):
         within = rotary_of(*grid, like=self.camera_token)
         across = within.repeat(frames)
         (_, first_global), *between, (last_frame, last_global) = self._layers()
-        x = first_global.complete(
-            first.tokens.flatten(1, 2),
-            *(part.transpose(1, 2).flatten(2, 3) for part in (first.q, first.k, first.v)))
+        x = first_global.complete(*(part.flatten(1, 2) for part in first))
         for frame_block, global_block in between:
             x = frame_block(x.view(batch * frames, -1, width), within)
             x = global_block(x.view(batch, -1, width), across)

@@ -16,7 +16,7 @@ from torch.nn import functional
 from kfvo_ros.backbones.vggt.rotary import Rotary
 
 QueriesKeysValues = tuple[Tensor, Tensor, Tensor]
-"""Each (B, heads, N, channels)."""
+"""Each (B, N, heads, channels)."""
 
 
 class Linear(nn.Linear):
@@ -93,12 +93,13 @@ class Attention(nn.Module):
 
     def forward(self, q: Tensor, k: Tensor, v: Tensor) -> Tensor:
         """Return the answers to the queries, (B, N, width)."""
-        answers = functional.scaled_dot_product_attention(q, k, v)
+        answers = functional.scaled_dot_product_attention(
+            q.transpose(1, 2), k.transpose(1, 2), v.transpose(1, 2))
         return self.proj(answers.transpose(1, 2).flatten(2))
 
     def _split(self, x: Tensor) -> tuple[Tensor, ...]:
-        """Cut (B, N, parts x width) into parts (B, heads, N, channels)."""
-        return x.unflatten(-1, (-1, self.heads, self.channels)).permute(2, 0, 3, 1, 4).unbind(0)
+        """Cut (B, N, parts x width) into parts (B, N, heads, channels)."""
+        return x.unflatten(-1, (-1, self.heads, self.channels)).unbind(2)
 
 
 class Block(nn.Module):

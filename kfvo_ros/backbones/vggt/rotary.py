@@ -20,19 +20,19 @@ BASE = 100.0
 
 
 class Rotary(NamedTuple):
-    """Cosine and sine (N, HEAD_SIZE) of the angles of N tokens, the sine with its sign."""
+    """Cosine and sine (N, 1, HEAD_SIZE) of the angles of N tokens, the sine with its sign."""
 
     cos: Tensor
     sin: Tensor
 
     def turn(self, x: Tensor) -> Tensor:
-        """Turn queries or keys x (..., N, HEAD_SIZE)."""
+        """Turn queries or keys x (..., N, heads, HEAD_SIZE)."""
         partner = x.unflatten(-1, (2, 2, -1)).flip(-2).flatten(-3)
         return torch.addcmul(x * self.cos, partner, self.sin)
 
     def repeat(self, frames: int) -> Rotary:
         """Return the table of several frames one after the other: they share their places."""
-        return Rotary(self.cos.repeat(frames, 1), self.sin.repeat(frames, 1))
+        return Rotary(self.cos.repeat(frames, 1, 1), self.sin.repeat(frames, 1, 1))
 
 
 def rotary_of(rows: int, columns: int, like: Tensor) -> Rotary:
@@ -49,5 +49,5 @@ def rotary_of(rows: int, columns: int, like: Tensor) -> Rotary:
     exponents = torch.arange(quarter, device=like.device, dtype=like.dtype) / quarter
     angles = places[:, :, None] * BASE ** -exponents
     cos, sin = angles.cos(), angles.sin()
-    return Rotary(torch.stack([cos, cos], dim=2).flatten(1),
-                  torch.stack([-sin, sin], dim=2).flatten(1))
+    return Rotary(torch.stack([cos, cos], dim=2).flatten(1)[:, None],
+                  torch.stack([-sin, sin], dim=2).flatten(1)[:, None])
