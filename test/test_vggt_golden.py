@@ -142,8 +142,8 @@ def tables_in_float32(monkeypatch: pytest.MonkeyPatch) -> None:
         grid = torch.cartesian_prod(torch.arange(1.0, rows + 1), torch.arange(1.0, columns + 1))
         angles = (torch.cat([torch.zeros(SPECIAL, 2), grid])[:, :, None] * frequencies).double()
         cos, sin = angles.cos(), angles.sin()
-        return Rotary(torch.stack([cos, cos], dim=2).flatten(1),
-                      torch.stack([-sin, sin], dim=2).flatten(1))
+        return Rotary(torch.stack([cos, cos], dim=2).flatten(1)[:, None],
+                      torch.stack([-sin, sin], dim=2).flatten(1)[:, None])
 
     monkeypatch.setattr(Trunk, 'places', rounded_places)
     monkeypatch.setattr(aggregator, 'rotary_of', rounded_rotary)
