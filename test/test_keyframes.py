@@ -11,6 +11,7 @@ from kfvo_ros import geometry
 from kfvo_ros.keyframes import POLICIES
 from kfvo_ros.keyframes.base import DecisionInput
 from kfvo_ros.keyframes.heuristics import MIN_TRACKS, Every, OpticalFlow, Survival
+from kfvo_ros.keyframes.learned import Learned
 from kfvo_ros.keyframes.observation import observe
 from kfvo_ros.tracking import Tracks
 
@@ -30,7 +31,7 @@ def decision(flow: float = 0.0, survivors: int = COUNT, start: int = COUNT) -> D
 
 
 def test_names():
-    assert tuple(policy.name for policy in (Every(), OpticalFlow(), Survival())) == POLICIES
+    assert tuple(kind.name for kind in (Every, OpticalFlow, Survival, Learned)) == POLICIES
 
 
 def test_every_keeps_without_tracks():

@@ -163,7 +163,7 @@ def test_another_resolution_begins_anew():
         messages = rig.drive(large)
         assert [is_origin(message) for message in messages] == [True, False, False, False]
         rig.wait_for_line('starting anew at the origin: the calibration changed')
-        rig.wait_for_line('camera 640x480, fx 400.0')
+        rig.wait_for_line('images of 640x480, fx 400.0')
         rig.wait_for_value('resets', 1)
 
 
@@ -193,7 +193,7 @@ def test_a_calibration_file_wins_over_the_topic(tmp_path):
     with Rig(camera_info_file=tmp_path / 'camera.yaml') as rig:
         rig.send(FRAMES[:4], with_info=False)
         assert len(rig.odometry(4)) == 4
-        assert str(tmp_path / 'camera.yaml') in rig.wait_for_line('camera 320x240')
+        assert str(tmp_path / 'camera.yaml') in rig.wait_for_line('images of 320x240')
         assert rig.info.get_subscription_count() == 0
 
 
