@@ -41,10 +41,10 @@ class KfvoNode(Node):
         super().__init__(NAME, automatically_declare_parameters_from_overrides=True)
         odometry, vggt, options = read_parameters(self, OdometryOptions, VggtOptions,
                                                   NodeOptions)
-        self._monitor = Monitor()
+        backbone = make_backbone(odometry, vggt)
+        self._monitor = Monitor()  # only now: until here no image could be waited for
         topic = self.resolve_topic_name(options.image_topic)
         cameras = CameraSource(self, topic, options.camera_info_topic, options.camera_info_file)
-        backbone = make_backbone(odometry, vggt)
         self._pipeline = Pipeline(self, backbone, odometry, options, cameras,
                                   Outputs(self, options), self._monitor)
         size = BACKLOG if options.process_every_frame else options.queue_size
