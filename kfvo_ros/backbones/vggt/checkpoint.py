@@ -20,7 +20,7 @@ from kfvo_ros.memory_use import available_mb
 
 PARTS = ('aggregator.', 'camera_head.')
 """What is built; the heads for depth, points and tracks of a full checkpoint are skipped."""
-AT_ONCE = 64
+AT_ONCE = 16
 """Tensors read before the file is closed and opened anew: what is mapped counts as memory."""
 FLOATS = (torch.float32, torch.float16, torch.bfloat16, torch.float64)
 NOT_TENSORS = '{}: expected tensors by name and nothing else, as state_dict() gives them'
