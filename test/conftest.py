@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -18,6 +19,13 @@ def one_thread() -> Iterator[None]:
     """Solve windows as the commands do: threads of BLAS that wait for each other cost minutes."""
     with single_threaded():
         yield
+
+
+@pytest.fixture(scope='session', autouse=True)
+def interruptible() -> None:
+    """Let the processes that tests interrupt be so: a shell's background jobs ignore SIGINT."""
+    if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope='session')
