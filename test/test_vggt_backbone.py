@@ -10,11 +10,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from odometry_scenes import Scripted
-from vggt_models import WIDTH, frames_seen, small_model, to_tensor, torch, window_of
+from vggt_models import WIDTH, changed, frames_seen, small_model, to_tensor, torch, window_of
 
 from kfvo_ros.backbones.base import LOST_VARIANCE, Estimate, Previous, Status, Window
 from kfvo_ros.backbones.vggt import pose_encoding
 from kfvo_ros.backbones.vggt.backbone import VggtBackbone
+from kfvo_ros.backbones.vggt.loading import load_backbone
 from kfvo_ros.backbones.vggt.preprocessing import fit
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.images import to_grey
@@ -187,6 +188,36 @@ def test_released_frames_hold_nothing(backbone):
     assert not any(isinstance(each, torch.Tensor | tuple) for name, each in vars(payload).items()
                    if name not in ('fit', 'grid'))
     window.stream.release(window.frames[0])  # once more does no harm
+
+
+# In float16, as loaded: the half precision that has fewer exponents
+
+
+@pytest.mark.parametrize('reuse', [True, False])
+@pytest.mark.parametrize('size', [2, 8])
+def test_float16_is_near(size, reuse, small_vggt):
+    """At most 1.6e-3 away was seen on a processor; bfloat16 is up to ten times as far."""
+    half, exact = (load_backbone(str(small_vggt), None, 'cpu', precision, WIDTH, reuse, size)
+                   for precision in ('fp16', 'fp32'))
+    assert half.condition()['precision'] == 'float16'
+    for seed in range(2):
+        frames = frames_seen(size, seed)
+        found, right = (each.estimate([window_of(each, frames)])[0] for each in (half, exact))
+        assert found.status is Status.OK
+        assert np.isfinite(found.T_anchor_frame).all() and np.isfinite(found.covariance).all()
+        assert 1e-5 < np.abs(found.T_anchor_frame - right.T_anchor_frame).max() < 5e-3
+        np.testing.assert_allclose(found.intrinsics, right.intrinsics, rtol=3e-3)
+
+
+@pytest.mark.parametrize(('dtype', 'status'), [
+    (torch.float32, Status.OK), (torch.bfloat16, Status.OK), (torch.float16, Status.LOST)])
+def test_what_float16_cannot_hold_is_lost(dtype, status):
+    model = changed(small_model(), dtype)
+    model.aggregator.patch_embed.blocks[0].norm2.weight.mul_(1e6)  # float16 ends at 65504
+    backbone = VggtBackbone(model, WIDTH)
+    estimate, = backbone.estimate([window_of(backbone, FRAMES[:3])])
+    assert estimate.status is status
+    assert np.isfinite(estimate.T_anchor_frame).all()
 
 
 # In the odometry

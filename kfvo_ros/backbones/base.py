@@ -5,6 +5,8 @@
 A backbone turns a window of frames into poses relative to its first frame, the anchor. It is
 told nothing about keyframe policies, trajectories or scale alignment. One `Backbone` serves
 many `Stream`s; all memory of one sequence lives in its stream, so a reset is a new stream.
+Sequences that go in step are encoded and estimated in one call for all, of which a model may
+make one batch.
 """
 
 from __future__ import annotations
@@ -155,6 +157,10 @@ class Backbone(ABC):
     @abstractmethod
     def open(self, camera: Camera | None) -> Stream:
         """Start a sequence; raises KfvoError when the camera does not fit the model."""
+
+    def encode(self, seen: Sequence[tuple[Stream, Frame]]) -> list[Encoded]:
+        """Take in the next frame of many streams in one call: `Stream.encode` for each."""
+        return [stream.encode(frame) for stream, frame in seen]
 
     @abstractmethod
     def estimate(self, windows: Sequence[Window]) -> list[Estimate]:

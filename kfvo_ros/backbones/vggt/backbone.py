@@ -4,7 +4,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Hashable, Sequence
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -17,7 +18,7 @@ from kfvo_ros.backbones.vggt.config import PATCH, SPECIAL
 from kfvo_ros.backbones.vggt.memory import FrameMemory, features_anew, features_reusing
 from kfvo_ros.backbones.vggt.model import Vggt
 from kfvo_ros.backbones.vggt.out_of_memory import memory_bounded
-from kfvo_ros.backbones.vggt.preprocessing import fit
+from kfvo_ros.backbones.vggt.preprocessing import Fit, fit
 from kfvo_ros.camera import Camera
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.sequences.base import Frame
@@ -29,22 +30,31 @@ TRANSLATION_DOUBT, ROTATION_DOUBT = 0.02, 0.005
 LEAST_DOUBT = 1e-3
 """Nor is a translation known better than this share of the window's extent."""
 
+Item = TypeVar('Item')
+Result = TypeVar('Result')
+
 
 class VggtStream(Stream):
     """Frames of one sequence, all of one size."""
 
     def __init__(self, backbone: VggtBackbone) -> None:
         self._backbone = backbone
-        self._size: tuple[int, ...] | None = None
+        self._fit: Fit | None = None
 
     def encode(self, frame: Frame) -> Encoded:
         """See the frame on its own; the descriptor is the trunk's CLS token."""
-        size = frame.image.shape[:2]
-        if self._size not in (None, size):
-            raise KfvoError(f'expected images of {self._size[1]}x{self._size[0]} as before, '
-                            f'{size[1]}x{size[0]} came')
-        self._size = size
-        return self._backbone.see(frame)
+        return self._backbone.encode([(self, frame)])[0]
+
+    def fit_of(self, frame: Frame) -> Fit:
+        """Return how the frame is fitted; raises KfvoError for another size than before."""
+        height, width = frame.image.shape[:2]
+        if self._fit is None:
+            self._fit = fit(height, width, self._backbone.image_width)
+        expected = self._fit
+        if (height, width) != (expected.native_height, expected.native_width):
+            raise KfvoError(f'expected images of {expected.native_width}x{expected.native_height} '
+                            f'as before, {width}x{height} came')
+        return expected
 
     def release(self, encoded: Encoded) -> None:
         """Free the frame's tensors."""
@@ -73,29 +83,15 @@ class VggtBackbone(Backbone):
         """Start a sequence; the camera need not be known."""
         return VggtStream(self)
 
-    def see(self, frame: Frame) -> Encoded:
-        """Encode one frame."""
-        height, width = frame.image.shape[:2]
-        fitted = fit(height, width, self.image_width)
-        with torch.inference_mode(), memory_bounded(self.device):
-            pixels = torch.tensor(fitted.apply(frame.image), device=self.device)
-            image = pixels.permute(2, 0, 1)[None] / 255.0
-            tokens = self.model.aggregator.see(image)
-            payload = FrameMemory(fitted, grid_of(image), image[0], tokens[:, SPECIAL:])
-            # Copied: a view would keep the tokens of the whole frame alive.
-            return Encoded(frame.stamp_ns, tokens[0, 0].float().cpu().numpy().copy(), payload)
+    def encode(self, seen: Sequence[tuple[Stream, Frame]]) -> list[Encoded]:
+        """See many frames, each on its own; those alike in fitted size go in one batch."""
+        fitted = [(frame, _stream_of(stream).fit_of(frame)) for stream, frame in seen]
+        return _in_batches(fitted, lambda each: (each[1].rows, each[1].width), self._see)
 
     def estimate(self, windows: Sequence[Window]) -> list[Estimate]:
         """Place the frames of many windows; those alike in frames and size go in one batch."""
-        alike: dict[tuple[int, tuple[int, int]], list[int]] = {}
-        for index, window in enumerate(windows):
-            alike.setdefault((len(window.frames), window.frames[0].payload.grid), []).append(index)
-        estimates: dict[int, Estimate] = {}
-        for indices in alike.values():
-            encodings = self.encodings([windows[index] for index in indices])
-            for position, index in enumerate(indices):
-                estimates[index] = _estimate(windows[index], encodings[:, position])
-        return [estimates[index] for index in range(len(windows))]
+        return _in_batches(windows, lambda window: (
+            len(window.frames), window.frames[0].payload.grid), self._place)
 
     def encodings(self, windows: Sequence[Window]) -> np.ndarray:
         """Return pose encodings (iterations, B, S, 9) of windows of one size."""
@@ -113,6 +109,42 @@ class VggtBackbone(Backbone):
             told |= {'device': f'{self.device} {torch.cuda.get_device_name(self.device)}',
                      'device memory [MiB]': f'{held:.0f}'}
         return told
+
+    def _see(self, frames: Sequence[tuple[Frame, Fit]]) -> list[Encoded]:
+        """Encode frames of one fitted size."""
+        with torch.inference_mode(), memory_bounded(self.device):
+            pixels = np.stack([fitted.apply(frame.image) for frame, fitted in frames])
+            images = torch.tensor(pixels, device=self.device).permute(0, 3, 1, 2) / 255.0
+            tokens = self.model.aggregator.see(images)
+            descriptors = tokens[:, 0].float().cpu().numpy()
+            # Copied: a view would keep the whole batch alive.
+            return [Encoded(frame.stamp_ns, descriptor.copy(), FrameMemory(
+                        fitted, grid_of(images), image.clone(), patches[None].clone()))
+                    for (frame, fitted), descriptor, image, patches in zip(
+                        frames, descriptors, images, tokens[:, SPECIAL:])]
+
+    def _place(self, windows: Sequence[Window]) -> list[Estimate]:
+        """Estimate windows of one size."""
+        encodings = self.encodings(windows)
+        return [_estimate(window, encodings[:, index]) for index, window in enumerate(windows)]
+
+
+def _stream_of(stream: Stream) -> VggtStream:
+    if not isinstance(stream, VggtStream):
+        raise TypeError(f'expected a VggtStream, came {type(stream)}')
+    return stream
+
+
+def _in_batches(items: Sequence[Item], kind: Callable[[Item], Hashable],
+                batch: Callable[[list[Item]], list[Result]]) -> list[Result]:
+    """Return what `batch` makes of the items, in their order; it is given one kind at a time."""
+    alike: dict[Hashable, list[int]] = {}
+    for index, item in enumerate(items):
+        alike.setdefault(kind(item), []).append(index)
+    results: dict[int, Result] = {}
+    for indices in alike.values():
+        results.update(zip(indices, batch([items[index] for index in indices])))
+    return [results[index] for index in range(len(items))]
 
 
 def _estimate(window: Window, encodings: np.ndarray) -> Estimate:

@@ -80,8 +80,9 @@ def _compare(arguments: argparse.Namespace, device: torch.device) -> None:
     plain = ours if arguments.against == 'same' else Scene(
         random_model(device, torch.float32), *shape, autocast=official)
     times = _time(plain, ours, arguments.rounds)
-    rates = {each: _matmul_rate(each, device, shape)
-             for each in {dtype, torch.float32 if plain is not ours else dtype}}
+    multiplied = {'same': dtype, 'fp32': torch.float32,
+                  'official': torch.bfloat16}[arguments.against]
+    rates = {each: _matmul_rate(each, device, shape) for each in {dtype, multiplied}}
     name = torch.cuda.get_device_name(device) if device.type == 'cuda' else \
         f'{torch.get_num_threads()} threads'
     print(f'{device} ({name}), torch {torch.__version__}, {shape[2]} frames of '
@@ -92,7 +93,7 @@ def _compare(arguments: argparse.Namespace, device: torch.device) -> None:
     for kind, flops in counts.items():
         median = statistics.median(times[kind])
         ratio = statistics.median(map(float.__truediv__, times['plain'], times[kind]))
-        rate = rates[torch.float32 if kind == 'plain' and plain is not ours else dtype]
+        rate = rates[multiplied if kind == 'plain' else dtype]
         print(f'{kind:12} {1e3 * median:9.1f} {ratio:5.2f}x {flops / 1e12:7.2f} '
               f'{flops / counts["plain"]:6.3f} {flops / median / rate:9.2f}')
     for kind in ('sliding', 'anchor kept'):
