@@ -67,7 +67,8 @@ def log_so3(rotation: np.ndarray) -> np.ndarray:
 
 def rotation_angle(rotation: np.ndarray) -> np.ndarray:
     """Return the angle (...,) [rad], in [0, pi], of rotations (..., 3, 3)."""
-    return np.linalg.norm(log_so3(rotation), axis=-1)
+    quaternion = quat_xyzw_from_rotation(rotation)
+    return 2.0 * np.arctan2(np.linalg.norm(quaternion[..., :3], axis=-1), quaternion[..., 3])
 
 
 def quat_xyzw_from_rotation(rotation: np.ndarray) -> np.ndarray:
@@ -81,16 +82,14 @@ def quat_xyzw_from_rotation(rotation: np.ndarray) -> np.ndarray:
                            r[..., 2, 1] + r[..., 1, 2])
     dif0, dif1, dif2 = (r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0],
                         r[..., 1, 0] - r[..., 0, 1])
-    candidates = np.stack([
-        np.stack([1 + d0 - d1 - d2, sum01, sum02, dif0], axis=-1),
-        np.stack([sum01, 1 - d0 + d1 - d2, sum12, dif1], axis=-1),
-        np.stack([sum02, sum12, 1 - d0 - d1 + d2, dif2], axis=-1),
-        np.stack([dif0, dif1, dif2, 1 + d0 + d1 + d2], axis=-1)], axis=-2)
-    largest = np.argmax(np.stack([d0 - d1 - d2, d1 - d0 - d2, d2 - d0 - d1, d0 + d1 + d2],
-                                 axis=-1), axis=-1)
-    quaternion = np.take_along_axis(candidates, largest[..., None, None], axis=-2)[..., 0, :]
-    quaternion = quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)
-    return np.where(quaternion[..., 3:] < 0, -quaternion, quaternion)
+    candidates = np.array([[1 + d0 - d1 - d2, sum01, sum02, dif0],
+                           [sum01, 1 - d0 + d1 - d2, sum12, dif1],
+                           [sum02, sum12, 1 - d0 - d1 + d2, dif2],
+                           [dif0, dif1, dif2, 1 + d0 + d1 + d2]])
+    largest = np.diagonal(candidates).argmax(axis=-1)
+    quaternion = np.choose(largest[..., None], np.moveaxis(candidates, 1, -1))
+    length = np.sqrt((quaternion * quaternion).sum(axis=-1, keepdims=True))
+    return quaternion / np.copysign(length, quaternion[..., 3:])
 
 
 def rotation_from_quat_xyzw(quat_xyzw: np.ndarray) -> np.ndarray:
@@ -113,19 +112,19 @@ def orthonormalise(transform: np.ndarray) -> np.ndarray:
     return make_transform(rotation_from_quat_xyzw(quat_xyzw), transform[..., :3, 3])
 
 
-def unit_rays(points: np.ndarray) -> np.ndarray:
-    """Return unit rays (N, 3) through normalised image coordinates (N, 2)."""
-    rays = np.column_stack([points, np.ones(len(points))])
-    return rays / np.linalg.norm(rays, axis=1, keepdims=True)
-
-
 def best_rotation(source: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Return the rotation (3, 3) that turns vectors `source` (N, 3) closest to `target` (N, 3).
 
     Source: Kabsch, "A solution for the best rotation to relate two sets of vectors", 1976.
     """
-    u, _, vt = np.linalg.svd(target.T @ source)
-    return (u * [1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))]) @ vt
+    return nearest_rotation(target.T @ source)
+
+
+def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
+    """Return the rotations (..., 3, 3) R of largest trace(R^T M) to matrices M (..., 3, 3)."""
+    u, _, vt = np.linalg.svd(matrix)
+    u[..., 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
+    return u @ vt
 
 
 @dataclass(frozen=True)
@@ -157,9 +156,9 @@ def umeyama(source: np.ndarray, target: np.ndarray, with_scale: bool = True) -> 
     if not np.ptp(source, axis=0).any():
         return Similarity(1.0, np.eye(3), mean_target - mean_source)
     centred_source, centred_target = source - mean_source, target - mean_target
-    variance = np.mean(np.sum(centred_source ** 2, axis=1))
+    variance = np.sum(centred_source ** 2) / len(source)
     u, singular, vt = np.linalg.svd(centred_target.T @ centred_source / len(source))
-    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
+    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
     rotation = (u * sign) @ vt
     scale = float(singular @ sign / variance) if with_scale and variance > 0.0 else 1.0
     return Similarity(scale, rotation, mean_target - scale * rotation @ mean_source)

@@ -61,9 +61,9 @@ def moved(points: Points | None, T_b_a: np.ndarray, scale: float) -> Points | No
 
 def turned(covariance: np.ndarray, T_b_a: np.ndarray, scale: float) -> np.ndarray:
     """Return a covariance (6, 6) of frame a, in another unit, in the axes of frame b."""
-    rotation = np.kron(np.eye(2), T_b_a[:3, :3])
-    unit = np.repeat([scale, 1.0], 3)
-    return rotation @ (covariance * np.outer(unit, unit)) @ rotation.T
+    into = np.zeros((6, 6))
+    into[:3, :3], into[3:, 3:] = scale * T_b_a[:3, :3], T_b_a[:3, :3]
+    return into @ covariance @ into.T
 
 
 def carried(covariance: np.ndarray, of_carrier: np.ndarray, offset: np.ndarray) -> np.ndarray:

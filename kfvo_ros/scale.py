@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from kfvo_ros import track_ids
 from kfvo_ros.backbones.base import Estimate, Points, Previous
 
 SCALE_RULES = ('none', 'translation', 'depth')
@@ -56,8 +57,7 @@ def compare_depths(known: Points | None, new: Points | None) -> float | None:
     """Return the information-weighted median ratio of known to new depths."""
     if known is None or new is None:
         return None
-    _, in_known, in_new = np.intersect1d(known.ids, new.ids, assume_unique=True,
-                                         return_indices=True)
+    in_known, in_new = track_ids.shared(known.ids, new.ids)
     if len(in_known) < MIN_SHARED_POINTS:
         return None
     ratios = known.depths[in_known] / np.maximum(new.depths[in_new], 1e-12)

@@ -58,9 +58,10 @@ def align(T_world_frame: np.ndarray, T_truth_frame: np.ndarray, last_scale: floa
     source, target = T_world_frame[:, :3, 3], T_truth_frame[:, :3, 3]
     spread_source, spread_target = (each - each.mean(axis=0) for each in (source, target))
     at_rest = np.linalg.norm(np.ptp(target, axis=0)) < STANDSTILL_M
-    first, second, *_ = np.linalg.svd(spread_target, compute_uv=False)
-    if not at_rest and second >= THIN * first and np.ptp(source, axis=0).any():
-        return geometry.umeyama(source, target)
+    if not at_rest and np.ptp(source, axis=0).any():
+        first, second, *_ = np.linalg.svd(spread_target, compute_uv=False)
+        if second >= THIN * first:
+            return geometry.umeyama(source, target)
     # R_truth_frame = R R_world_frame for every frame: the nearest rotation to all of them.
     rotation = geometry.best_rotation(
         np.swapaxes(T_world_frame[:, :3, :3], 1, 2).reshape(-1, 3),

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import poselib
 
-from kfvo_ros import geometry
+from kfvo_ros import geometry, track_ids
 from kfvo_ros.backbones.base import Previous
 from kfvo_ros.backbones.geometric import kernels
-from kfvo_ros.backbones.geometric.bundle_adjustment import State
+from kfvo_ros.backbones.geometric.bundle_adjustment import MIN_DEPTH, State
 from kfvo_ros.backbones.geometric.memory import History
 from kfvo_ros.backbones.geometric.observations import Observations
 
@@ -151,10 +151,10 @@ class Initialiser:
             return latest
         T_keyframe_newest = self._relative_pose(observations, keyframe, newest)
         T_newest_keyframe = geometry.invert(T_keyframe_newest)
-        T_keyframe_host = geometry.relative(T_anchor_frame[keyframe],
-                                            T_anchor_frame[observations.hosts[visible]])
-        X = np.einsum('pij,pj->pi', T_keyframe_host[:, :3, :3], observations.rays[visible]
-                      / inverse_depths[visible, None]) + T_keyframe_host[:, :3, 3]
+        T_keyframe_frame = geometry.relative(T_anchor_frame[keyframe], T_anchor_frame)
+        X = kernels.place(*_rotations_and_translations(T_keyframe_frame),
+                          observations.hosts[visible], observations.rays[visible],
+                          inverse_depths[visible])
         x = np.column_stack([observations.seen[visible, newest], np.ones(visible.sum())])
         turned = np.cross(x, X @ T_newest_keyframe[:3, :3].T)
         moved = np.cross(x, T_newest_keyframe[:3, 3])
@@ -184,11 +184,12 @@ class Initialiser:
         """Return T_w_frame of `frame` from points of known depth."""
         if usable.sum() < MIN_RESECTION_POINTS:
             return fallback
-        T_w_host = T_w_frame[observations.hosts[usable]]
-        positions = np.einsum('pij,pj->pi', T_w_host[:, :3, :3], observations.rays[usable]
-                              / inverse_depths[usable, None]) + T_w_host[:, :3, 3]
+        rows = np.flatnonzero(usable)
+        positions = kernels.place(*_rotations_and_translations(T_w_frame),
+                                  observations.hosts[rows], observations.rays[rows],
+                                  inverse_depths[rows])
         pose, info = poselib.estimate_absolute_pose(
-            self.focal * observations.seen[usable, frame], positions, self._camera,
+            self.focal * observations.seen[rows, frame], positions, self._camera,
             ABSOLUTE_POSE | {'seed': self._seed}, {})
         if info['num_inliers'] < MIN_RESECTION_POINTS:
             return fallback
@@ -201,11 +202,11 @@ class Initialiser:
         triangulated, weights = _triangulate(observations, T_anchor_frame)
         believed = triangulated > LEAST_INVERSE_DEPTH
         reference = triangulated[believed] if unknown.all() else inverse_depths[~unknown]
-        median = float(np.median(reference)) if len(reference) else 1.0
+        median = kernels.median(reference) if len(reference) else 1.0
         believed &= (triangulated > NEAREST * median) & (triangulated < FARTHEST * median)
         believed &= self.focal * np.sqrt(weights) * MAX_SPREAD * median > 1.0
         filled = np.where(unknown, np.where(believed, triangulated, median), inverse_depths)
-        return State(T_anchor_frame[:, :3, :3].copy(), T_anchor_frame[:, :3, 3].copy(), filled)
+        return State(*_rotations_and_translations(T_anchor_frame), filled)
 
 
 def known_inverse_depths(observations: Observations, T_anchor_frame: np.ndarray,
@@ -214,12 +215,11 @@ def known_inverse_depths(observations: Observations, T_anchor_frame: np.ndarray,
     inverse_depths = np.full(len(observations), np.nan)
     if previous.points is None:
         return inverse_depths
-    _, rows, known = np.intersect1d(observations.ids, previous.points.ids, assume_unique=True,
-                                    return_indices=True)
-    T_anchor_host = T_anchor_frame[observations.hosts[rows]]
-    towards = previous.points.positions[known] - T_anchor_host[:, :3, 3]
-    depths = np.einsum('pi,pi->p', T_anchor_host[:, :3, 2], towards)
-    in_front = depths > kernels.MIN_DEPTH
+    rows, known = track_ids.shared(observations.ids, previous.points.ids)
+    hosts = observations.hosts[rows]
+    towards = previous.points.positions[known] - T_anchor_frame[hosts, :3, 3]
+    depths = (T_anchor_frame[hosts, :3, 2] * towards).sum(axis=1)
+    in_front = depths > MIN_DEPTH
     inverse_depths[rows[in_front]] = 1.0 / depths[in_front]
     return inverse_depths
 
@@ -231,23 +231,26 @@ def _expect(observations: Observations, known: np.ndarray, filled: np.ndarray) -
     nothing is, as the scene's median.
     """
     is_known = np.isfinite(known)
-    expected = np.where(is_known, known, np.median(known[is_known] if is_known.any() else filled))
+    median = kernels.median(known[is_known] if is_known.any() else filled)
+    expected = np.where(is_known, known, median)
     visible = observations.mask[:, -1]
     old, new = np.flatnonzero(is_known & visible), np.flatnonzero(~is_known & visible)
     if len(old) >= NEIGHBOURS and len(new):
         points = observations.seen[:, -1]
-        distances = np.linalg.norm(points[new, None] - points[None, old], axis=2)
-        nearest = np.argpartition(distances, NEIGHBOURS - 1, axis=1)[:, :NEIGHBOURS]
-        expected[new] = np.median(known[old[nearest]], axis=1)
+        expected[new] = kernels.medians_of_nearest(points[new], points[old], known[old],
+                                                   NEIGHBOURS)
     return expected
 
 
 def _triangulate(observations: Observations,
                  T_anchor_frame: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return kernels.triangulate(
-        np.ascontiguousarray(T_anchor_frame[:, :3, :3]),
-        np.ascontiguousarray(T_anchor_frame[:, :3, 3]), observations.hosts, observations.rays,
-        observations.seen, observations.mask)
+    return kernels.triangulate(*_rotations_and_translations(T_anchor_frame), observations.hosts,
+                               observations.rays, observations.seen, observations.mask)
+
+
+def _rotations_and_translations(transforms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return what the kernels take of poses (F, 4, 4): (F, 3, 3) and (F, 3)."""
+    return transforms[:, :3, :3].copy(), transforms[:, :3, 3].copy()
 
 
 def _inverse_of(pose: Any) -> np.ndarray:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from kfvo_ros import geometry
+from kfvo_ros import geometry, track_ids
 from kfvo_ros.backbones.base import Previous
 from kfvo_ros.backbones.geometric.observations import View
 
@@ -67,5 +67,5 @@ def recall(previous: Previous | None, anchor: View) -> History:
 
 def _differ(older: View, newer: View) -> bool:
     """Return whether enough of the older view's tracks ended before the newer one."""
-    shared = np.isin(older.tracks.ids, newer.tracks.ids, assume_unique=True).sum()
-    return bool(shared < MAX_SHARED * len(older.tracks))
+    shared, _ = track_ids.shared(older.tracks.ids, newer.tracks.ids)
+    return len(shared) < MAX_SHARED * len(older.tracks)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from kfvo_ros.backbones.geometric import kernels
 from kfvo_ros.tracking import Tracks
 
 
@@ -45,17 +46,10 @@ class Observations:
 
 def tabulate(views: Sequence[View], anchor: int) -> Observations:
     """Gather the tracks of `views`, oldest first, that a frame after the anchor sees."""
-    ids, counts = np.unique(np.concatenate([view.tracks.ids for view in views]),
-                            return_counts=True)
-    moving = np.unique(np.concatenate([view.tracks.ids for view in views[anchor + 1:]]))
-    ids = ids[(counts >= 2) & np.isin(ids, moving)]
-    seen = np.zeros((len(ids), len(views), 2))
-    mask = np.zeros((len(ids), len(views)), dtype=bool)
-    for frame, view in enumerate(views):
-        _, rows, columns = np.intersect1d(ids, view.tracks.ids, assume_unique=True,
-                                          return_indices=True)
-        seen[rows, frame] = view.points[columns]
-        mask[rows, frame] = True
+    ids, seen, mask = kernels.merge(
+        np.concatenate([view.tracks.ids for view in views]),
+        np.concatenate([view.points for view in views]),
+        np.cumsum([len(view.points) for view in views]), anchor + 1)
     hosts = mask.argmax(axis=1) if len(ids) else np.zeros(0, dtype=np.int64)
     rays = np.ones((len(ids), 3))
     rays[:, :2] = seen[np.arange(len(ids)), hosts]

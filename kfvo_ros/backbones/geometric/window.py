@@ -5,12 +5,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from kfvo_ros import geometry
 from kfvo_ros.backbones.base import Points, Previous
 from kfvo_ros.backbones.geometric import bundle_adjustment as ba
+from kfvo_ros.backbones.geometric import kernels
 from kfvo_ros.backbones.geometric.initialisation import Guess, Initialiser
 from kfvo_ros.backbones.geometric.memory import History
 from kfvo_ros.backbones.geometric.observations import Observations
@@ -31,6 +33,8 @@ SUSPICIOUS_SHARE = 0.5
 """When fewer of the newest frame's tracks fit, its first place may have been wrong."""
 MIN_INFORMATION = 30.0
 """The median depth is known to 18 % from tracks good to a pixel: worth to be held on to."""
+MIN_PIVOT_RATIO = 1e-6
+"""A system whose Cholesky factor has pivots further apart leaves directions undetermined."""
 LEAST_NOISE = 0.1
 """Tracks are never believed to be better than this [px]."""
 
@@ -54,28 +58,32 @@ class Solution:
         """Mask (P,) of the points that at least two frames still agree on."""
         return self.inliers.sum(axis=1) >= 2
 
-    @property
+    @cached_property
     def T_anchor_frame(self) -> np.ndarray:
         """Poses (F, 4, 4) of all frames, exactly identity for the anchor."""
-        poses = geometry.orthonormalise(
-            geometry.make_transform(self.state.rotations, self.state.translations))
+        poses = geometry.make_transform(self.state.rotations, self.state.translations)
         poses[self.anchor] = np.eye(4)
         return poses
 
     @property
     def certain(self) -> bool:
         """Whether depths are measured well enough to be held on to."""
-        information = self.points().information
-        return len(information) > 0 and float(np.median(information)) > MIN_INFORMATION
+        return self.median_information > MIN_INFORMATION
 
+    @cached_property
+    def median_information(self) -> float:
+        """Median information of the points' depths, 0 without points."""
+        return kernels.median(self.points.information) if len(self.points.ids) else 0.0
+
+    @cached_property
     def points(self) -> Points:
         """Return the solved points; a depth's information is that given the poses."""
-        rows = self.solved
+        rows = np.flatnonzero(self.solved)
         hosts = self.observations.hosts[rows]
         inverse_depths = self.state.inverse_depths[rows]
-        rays = self.observations.rays[rows] / inverse_depths[:, None]
-        positions = np.einsum('pij,pj->pi', self.state.rotations[hosts], rays)
-        return Points(self.observations.ids[rows], positions + self.state.translations[hosts],
+        positions = kernels.place(self.state.rotations, self.state.translations, hosts,
+                                  self.observations.rays[rows], inverse_depths)
+        return Points(self.observations.ids[rows], positions,
                       self.normal.H_pp[rows] * inverse_depths ** 2)
 
     def covariance(self) -> np.ndarray:
@@ -84,18 +92,17 @@ class Solution:
         It contains how well the window's scale is tied to the past, by history and depth
         priors: where points have no parallax it grows, which reprojection errors do not show.
         """
-        free = self.state.rotations[self.anchor + 1:]
         measured = self.inliers & (self.errors > 0.0)
-        typical = float(np.median(self.errors[measured])) if measured.any() else 1.0
+        typical = kernels.median(self.errors[measured]) if measured.any() else 1.0
         noise = max(LEAST_NOISE, typical)
-        system, _ = self.normal.reduce()
-        blocks = noise ** 2 * np.linalg.pinv(system, hermitian=True)
-        covariance = np.zeros((len(free) + 1, 6, 6))
-        for index, rotation in enumerate(free):
-            rows = slice(6 * index, 6 * index + 6)
-            turn = np.zeros((6, 6))
-            turn[:3, 3:], turn[3:, :3] = np.eye(3), rotation
-            covariance[index + 1] = turn @ blocks[rows, rows] @ turn.T
+        system, _ = ba.reduce(self.normal, 0.0)
+        free = len(system) // 6
+        blocks = noise ** 2 * _inverse(system).reshape(free, 6, free, 6)
+        turns = np.zeros((free, 6, 6))
+        turns[:, :3, 3:], turns[:, 3:, :3] = np.eye(3), self.state.rotations[self.anchor + 1:]
+        covariance = np.zeros((free + 1, 6, 6))
+        own = np.arange(free)
+        covariance[1:] = turns @ blocks[own, :, own] @ np.swapaxes(turns, 1, 2)
         return 0.5 * (covariance + np.swapaxes(covariance, 1, 2))
 
 
@@ -149,7 +156,7 @@ def _finish(observations: Observations, draft: _Draft, anchor: int) -> Solution:
     """Adjust again without the outliers."""
     problem, state = draft.problem, draft.state
     if (draft.inliers != observations.mask).any():
-        problem = problem.observed(draft.inliers)
+        problem = problem._replace(mask=draft.inliers)
         state = ba.adjust(problem, state, FINAL_ITERATIONS)
     return Solution(observations, anchor, state, draft.inliers,
                     ba.reprojection_errors(problem, state), ba.linearise(problem, state))
@@ -159,6 +166,17 @@ def _problem(observations: Observations, focal: float, guess: Guess, fixed: int)
     """Return the bundle adjustment of a window, depths drawn to where they are expected."""
     expected = guess.expected_inverse_depths
     strength = np.where(guess.known, KNOWN_DEPTH_PRIOR, NEW_DEPTH_PRIOR)
-    spread = np.maximum(expected, LEAST_PRIOR_SPREAD * np.median(expected))
+    spread = np.maximum(expected, LEAST_PRIOR_SPREAD * kernels.median(expected))
     return ba.Problem(observations.hosts, observations.rays, observations.seen, observations.mask,
                       focal, fixed, strength / spread ** 2, expected)
+
+
+def _inverse(system: np.ndarray) -> np.ndarray:
+    """Return the inverse of a symmetric system, 0 in directions that nothing determines."""
+    try:
+        pivots = np.linalg.cholesky(system).diagonal()
+    except np.linalg.LinAlgError:
+        return np.linalg.pinv(system, hermitian=True)
+    if pivots.min() < MIN_PIVOT_RATIO * pivots.max():
+        return np.linalg.pinv(system, hermitian=True)
+    return np.linalg.inv(system)

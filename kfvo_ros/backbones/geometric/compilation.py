@@ -1,0 +1,11 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""How the loops of this backbone are compiled: once, kept on disk, free of the interpreter."""
+
+from __future__ import annotations
+
+import numba
+
+compiled = numba.njit(cache=True, nogil=True, error_model='numpy',
+                      fastmath={'contract', 'reassoc'})
+"""Sums may be taken in any order, which lets the processor take four terms at a time."""
