@@ -45,7 +45,7 @@ setup(
             'ros-common-interfaces==5.3.6',
         ],
         'vggt': ['torch>=2.3', 'huggingface_hub>=0.23', 'pillow>=9.0'],
-        'train': ['stable-baselines3>=2.4', 'gymnasium>=0.29.1', 'tensorboard>=2.9'],
+        'train': ['stable-baselines3>=2.4', 'gymnasium>=0.29.1', 'tensorboard>=2.9', 'pillow>=9.0'],
         'demo': ['matplotlib>=3.6'],
         'test': ['colcon-common-extensions', 'evo>=1.31', 'mypy', 'pytest>=7.0', 'ruff'],
     },

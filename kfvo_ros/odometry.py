@@ -18,6 +18,7 @@ from kfvo_ros.backbones.base import (
     Stream,
     Window,
 )
+from kfvo_ros.camera import Camera
 from kfvo_ros.images import to_grey
 from kfvo_ros.keyframes.base import DecisionInput, KeyframePolicy
 from kfvo_ros.keyframes.observation import observe
@@ -129,14 +130,19 @@ class KeyframeOdometry:
             keep = decision if isinstance(decision, bool) else self.policy.decide(decision)
         return self.commit(keep, clock.durations)
 
+    def open(self, camera: Camera | None) -> Stream:
+        """Return the sequence's stream; its first frame opens it."""
+        if self._stream is None:
+            self._stream = self.backbone.open(camera)
+        return self._stream
+
     def begin(self, frame: Frame, encoded: Encoded | None = None) -> Window | None:
         """Encode the frame (step 1); return its window, None when there is nothing before it.
 
         A frame that was encoded before need not be again.
         """
-        if self._stream is None:
-            self._stream = self.backbone.open(frame.camera)
-        encoded = encoded or self._stream.encode(frame)
+        stream = self.open(frame.camera)
+        encoded = encoded or stream.encode(frame)
         self._newest = Keyframe(encoded, self._track(frame, encoded), self._frames_seen,
                                 self._known.T_world_latest, self._known.covariance)
         self._frames_seen += 1
@@ -145,7 +151,7 @@ class KeyframeOdometry:
         if not self._keyframes:
             return None
         self._previous = self._known.seen_from(self._keyframes)
-        return Window(self._stream, tuple(frame.encoded for frame in self.window),
+        return Window(stream, tuple(frame.encoded for frame in self.window),
                       self._previous)
 
     def integrate(self, estimate: Estimate | None) -> DecisionInput | bool:

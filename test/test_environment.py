@@ -22,13 +22,14 @@ from kfvo_ros.keyframes.rail import Rail
 from kfvo_ros.learning.drives import Drive, record
 from kfvo_ros.learning.environment import OBSERVATION, PRIVILEGED, KeyframeEnvironment
 from kfvo_ros.learning.episode import PRIVILEGED_SIZE, Episode
-from kfvo_ros.learning.reward import PaperReward
+from kfvo_ros.learning.reward import PaperReward, Reward
 from kfvo_ros.odometry import KeyframeOdometry
 from kfvo_ros.sequences.synthetic import SyntheticSequence
 
 FRAMES = 30
 NO_RAIL = Rail(min_survival=0.0, max_gap=10 ** 6, min_flow=0.0)
 SIZE = 48 + 7 * 7 + 8
+ALL = np.arange(SIZE)
 
 
 @pytest.fixture(scope='module')
@@ -81,7 +82,7 @@ def test_an_environment_sees_what_a_running_policy_sees(backbone, drives):
     updates = [odometry.process(frame) for frame in SyntheticSequence(3, 'smooth', FRAMES)]
     assert all(update.status is not Status.LOST for update in updates)
 
-    environment = KeyframeEnvironment(backbone, [again(drives[0], backbone)], SIZE)
+    environment = KeyframeEnvironment(backbone, [again(drives[0], backbone)], ALL)
     seen = [environment.reset()[OBSERVATION][0]]
     for number in range(FRAMES - 8):
         observations, _, dones, _ = environment.step(answers[number:number + 1])
@@ -90,10 +91,18 @@ def test_an_environment_sees_what_a_running_policy_sees(backbone, drives):
     np.testing.assert_array_equal(seen, policy.seen)
 
 
+def test_what_is_hidden_is_not_there(backbone, drives):
+    source = again(drives[0], backbone)
+    everything = KeyframeEnvironment(backbone, [source], ALL).reset()[OBSERVATION][0]
+    environment = KeyframeEnvironment(backbone, [source], ALL[48:])
+    assert environment.observation_space[OBSERVATION].shape == (SIZE - 48,)
+    np.testing.assert_array_equal(environment.reset()[OBSERVATION][0], everything[48:])
+
+
 def test_two_sequences_take_one_call_per_step(drives):
     backbone = Counting()
     environment = KeyframeEnvironment(
-        backbone, [again(drive, backbone) for drive in drives], SIZE)
+        backbone, [again(drive, backbone) for drive in drives], ALL)
     environment.reset()
     backbone.calls.clear()
     for _ in range(5):
@@ -104,21 +113,21 @@ def test_two_sequences_take_one_call_per_step(drives):
 
 
 def test_the_end_begins_the_next_episode_and_tells_the_last_observation(backbone, drives):
-    environment = KeyframeEnvironment(backbone, [again(drives[0], backbone)], SIZE)
+    environment = KeyframeEnvironment(backbone, [again(drives[0], backbone)], ALL)
     first = environment.reset()[OBSERVATION][0]
     decisions = FRAMES - 7
     for _ in range(decisions - 1):
         last, _, dones, infos = environment.step(np.array([1]))
         assert not dones[0] and not infos[0]
     observations, rewards, dones, infos = environment.step(np.array([1]))
-    assert dones[0] and rewards[0] != 0.0
+    assert dones[0] and rewards[0] != 0.0 and infos[0]['TimeLimit.truncated']
     np.testing.assert_array_equal(observations[OBSERVATION][0], first)
     np.testing.assert_array_equal(infos[0]['terminal_observation'][OBSERVATION],
                                   last[OBSERVATION][0])
 
 
 def test_the_critic_is_told_true_motions_in_the_trajectory_s_unit(backbone, drives):
-    environment = KeyframeEnvironment(backbone, [again(drives[0], backbone)], SIZE)
+    environment = KeyframeEnvironment(backbone, [again(drives[0], backbone)], ALL)
     told = environment.reset()[PRIVILEGED][0]
     truth = drives[0].T_truth_camera
     true_motions = [geometry.relative(truth[7], truth[6]), geometry.relative(truth[7], truth[8]),
@@ -139,7 +148,7 @@ def test_the_critic_is_told_true_motions_in_the_trajectory_s_unit(backbone, driv
 
 def test_where_the_rail_decides_nobody_is_asked(backbone, drives):
     always = Rail(min_survival=0.0, max_gap=3, min_flow=0.0)
-    environment = KeyframeEnvironment(backbone, [again(drives[0], backbone, always)], SIZE)
+    environment = KeyframeEnvironment(backbone, [again(drives[0], backbone, always)], ALL)
     environment.reset()
     asked = 1
     while True:
@@ -155,10 +164,55 @@ def test_lost_and_unanswered_episodes_never_reach_the_rollout(backbone, drives):
     short = Drive('short', drives[0].frames[:5], drives[0].encoded[:5],
                   drives[0].T_truth_camera[:5])
     sources = iter([begin(short, backbone), begin(short, backbone), begin(drives[1], backbone)])
-    environment = KeyframeEnvironment(backbone, [sources], SIZE)
+    environment = KeyframeEnvironment(backbone, [sources], ALL)
     seen = environment.reset()[OBSERVATION][0]
-    alone = KeyframeEnvironment(backbone, [again(drives[1], backbone)], SIZE)
+    alone = KeyframeEnvironment(backbone, [again(drives[1], backbone)], ALL)
     np.testing.assert_array_equal(seen, alone.reset()[OBSERVATION][0])
+
+
+def test_frames_not_seen_before_are_encoded_in_one_call(backbone, drives):
+    class Seeing(Counting):
+        def encode(self, seen):
+            self.calls.append(-len(seen))
+            return super().encode(seen)
+
+    seeing = Seeing()
+    live = [record(SyntheticSequence(seed, 'smooth', FRAMES), None) for seed in (3, 4)]
+    environment = KeyframeEnvironment(seeing, [again(drive, seeing) for drive in live], ALL)
+    known = KeyframeEnvironment(backbone, [again(drive, backbone) for drive in drives], ALL)
+    for each in (environment, known):
+        each.reset()
+    seeing.calls.clear()
+    for _ in range(5):
+        seen, recorded = (each.step(np.array([1, 0])) for each in (environment, known))
+        np.testing.assert_array_equal(seen[0][OBSERVATION], recorded[0][OBSERVATION])
+    assert seeing.calls == [-2, 2] * 5
+
+
+def test_a_reward_may_ask_for_a_stretch_of_the_trajectory(backbone, drives):
+    class Looking(Reward):
+        span = 10
+
+        def __init__(self) -> None:
+            self.told = []
+
+        def __call__(self, T_world_frame, T_truth_frame, keep):
+            self.told.append((T_world_frame, T_truth_frame))
+            return 1.0
+
+    looking = Looking()
+    episode = Episode(drives[0], backbone, 'depth', 8, NO_RAIL, looking)
+    environment = KeyframeEnvironment(backbone, [iter([episode])], ALL)
+    environment.reset()
+    for number in range(FRAMES - 8):
+        environment.step(np.array([number % 2]))
+    estimated, true = looking.told[-1]
+    np.testing.assert_array_equal(true, drives[0].T_truth_camera[-11:-1])
+    aligned = geometry.umeyama(estimated[:, :3, 3], true[:, :3, 3])
+    path = np.linalg.norm(np.diff(true[:, :3, 3], axis=0), axis=1).sum()
+    assert np.abs(aligned.transform_points(estimated[:, :3, 3]) - true[:, :3, 3]).max() \
+        < 0.02 * path
+    assert len(looking.told[0][0]) == 8
 
 
 def test_a_sequence_without_truth_of_the_camera_is_refused(backbone):
@@ -174,7 +228,7 @@ def test_stable_baselines_learns_in_it(drives):
     from stable_baselines3 import PPO
     backbone = GeometricBackbone()
     environment = KeyframeEnvironment(
-        backbone, [again(drive, backbone) for drive in drives], SIZE)
+        backbone, [again(drive, backbone) for drive in drives], ALL)
     model = PPO('MultiInputPolicy', environment, n_steps=16, batch_size=16, n_epochs=1, seed=0,
                 device='cpu')
     before = model.policy.action_net.weight.detach().clone()

@@ -4,18 +4,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections import deque
 
 import numpy as np
 
 from kfvo_ros import geometry
-from kfvo_ros.backbones.base import Backbone, Estimate, Window
+from kfvo_ros.backbones.base import Backbone, Encoded, Estimate, Stream, Window
 from kfvo_ros.keyframes.base import DecisionInput
 from kfvo_ros.keyframes.heuristics import Every
 from kfvo_ros.keyframes.rail import Rail
 from kfvo_ros.learning.drives import Drive
-from kfvo_ros.learning.reward import ALIGNED, align
-from kfvo_ros.odometry import KeyframeOdometry
+from kfvo_ros.learning.reward import ALIGNED, Reward, align
+from kfvo_ros.odometry import KeyframeOdometry, Placed
+from kfvo_ros.sequences.base import Frame
 
 AHEAD = 2
 """So many true motions to come are told to the critic."""
@@ -23,39 +24,44 @@ POSE = 7
 PRIVILEGED_SIZE = (1 + AHEAD) * POSE + 1
 
 
-Reward = Callable[[np.ndarray, np.ndarray, bool], float]
-"""What a decision on a window of estimated and true poses (S, 4, 4) is worth."""
-
-
 class Episode:
     """Drives through a sequence, and stops where there is something to decide.
 
     ``decision`` is what the policy sees there, None before the first one and once it ``ended``:
     at the last frame, or when the camera is lost. Where the rail decides nobody is asked, and
-    before the first question nothing is earned. The caller runs the backbone: `enter`, estimate
-    the window, `leave`, until there is a decision.
+    before the first question nothing is earned. The caller runs the backbone: encode what is
+    `unseen`, `enter`, estimate the window, `leave`, until there is a decision.
     """
 
     def __init__(self, drive: Drive, backbone: Backbone, scale_rule: str, window_size: int,
                  rail: Rail, reward: Reward) -> None:
         self._drive, self._rail, self._reward = drive, rail, reward
         self._odometry = KeyframeOdometry(backbone, Every(), scale_rule, window_size)
+        self._trail: deque[tuple[Placed, int]] = deque(maxlen=reward.span or 0)
         self._next = 0
         self.decision: DecisionInput | None = None
         self.ended = False
         self._asked = False
         self._earned = 0.0
 
-    def enter(self) -> Window | None:
+    def unseen(self) -> tuple[Stream, Frame] | None:
+        """Return the next frame, and its stream, where it has to be encoded first."""
+        if self._drive.encoded[self._next] is not None:
+            return None
+        frame = self._drive.frames[self._next]
+        return self._odometry.open(frame.camera), frame
+
+    def enter(self, encoded: Encoded | None = None) -> Window | None:
         """Take in the next frame; return the window to estimate, None for the very first."""
         index, self._next = self._next, self._next + 1
-        return self._odometry.begin(self._drive.frames[index], self._drive.encoded[index])
+        return self._odometry.begin(self._drive.frames[index],
+                                    encoded or self._drive.encoded[index])
 
     def leave(self, estimate: Estimate | None) -> None:
         """Go on to a decision where there is one, else decide as the odometry or the rail does."""
         decision = self._odometry.integrate(estimate)
         if isinstance(decision, bool):
-            self._odometry.commit(decision, {})
+            self._commit(decision)
             self.ended = not decision or self._next == len(self._drive)
             return
         forced = self._rail.forced(decision)
@@ -66,9 +72,10 @@ class Episode:
 
     def decide(self, keep: bool) -> None:
         """Keep or drop the frame, and earn what that is worth."""
-        worth = self._reward(*self._window(), keep)
+        window = self._window() if self._reward.span is None else None
+        self._commit(keep)
+        worth = self._reward(*(window or self._recent()), keep)
         self._earned += worth if self._asked else 0.0
-        self._odometry.commit(keep, {})
         self.decision = None
         self.ended = self._next == len(self._drive)
 
@@ -86,18 +93,25 @@ class Episode:
         estimated, true = self._window()
         scale = align(estimated[:ALIGNED], true[:ALIGNED], 1.0).scale
         ahead = self._drive.T_truth_camera[self._next - 1:self._next + AHEAD]
-        motions = [geometry.relative(true[-1], true[-2]),
-                   *(geometry.relative(a, b) for a, b in zip(ahead, ahead[1:]))]
-        told = np.zeros(PRIVILEGED_SIZE, dtype=np.float32)
-        for number, motion in enumerate(motions):
-            told[number * POSE:(number + 1) * POSE] = np.concatenate([
-                motion[:3, 3] / max(scale, 1e-9),
-                geometry.quat_xyzw_from_rotation(motion[:3, :3])])
-        told[-1] = len(motions) < 1 + AHEAD
-        return told
+        motions = np.concatenate([geometry.relative(true[-1:], true[-2:-1]),
+                                  geometry.relative(ahead[:-1], ahead[1:])])
+        told = np.zeros((1 + AHEAD, POSE), dtype=np.float32)
+        told[:len(motions), :3] = motions[:, :3, 3] / max(scale, 1e-9)
+        told[:len(motions), 3:] = geometry.quat_xyzw_from_rotation(motions[:, :3, :3])
+        return np.append(told, np.float32(len(motions) < len(told)))
+
+    def _commit(self, keep: bool) -> None:
+        self._odometry.commit(keep, {})
+        self._trail.append((self._odometry.pending[-1], self._next - 1))
 
     def _window(self) -> tuple[np.ndarray, np.ndarray]:
         """Return estimated and true poses (S, 4, 4) of the frames in the window."""
         window = self._odometry.window
         return (np.stack([frame.T_world_camera for frame in window]),
                 self._drive.T_truth_camera[[frame.index for frame in window]])
+
+    def _recent(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return estimated and true poses (S, 4, 4) of the last input frames, as known now."""
+        return (np.stack([placed.keyframe.T_world_camera for placed, _ in self._trail])
+                @ np.stack([placed.T_keyframe_camera for placed, _ in self._trail]),
+                self._drive.T_truth_camera[[index for _, index in self._trail]])

@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+
 import numpy as np
 
 from kfvo_ros import geometry
@@ -24,7 +26,22 @@ STANDSTILL_M = 0.01
 """Where the truth moved less, no scale can be told."""
 
 
-class PaperReward:
+class Reward(ABC):
+    """What one decision of an episode is worth; one object serves one episode.
+
+    It is told poses of the window's frames, or, where ``span`` is set, of that many input frames
+    up to the newest.
+    """
+
+    span: int | None = None
+
+    @abstractmethod
+    def __call__(self, T_world_frame: np.ndarray, T_truth_frame: np.ndarray,
+                 keep: bool) -> float:
+        """Return the worth of a decision from estimated and true poses (S, 4, 4)."""
+
+
+class PaperReward(Reward):
     """The error of the newest frame once the window's first poses are aligned to the truth.
 
     Remembers the last scale, for windows at rest. `alpha` is added, weighted, for a keyframe.
@@ -36,7 +53,7 @@ class PaperReward:
 
     def __call__(self, T_world_frame: np.ndarray, T_truth_frame: np.ndarray,
                  keep: bool) -> float:
-        """Return the reward of a decision on a window, estimated and true poses (S, 4, 4)."""
+        """Return the reward of a decision on a window."""
         error = self.error(T_world_frame, T_truth_frame)
         return (ERROR_WEIGHT * max(WORST, ACCEPTED_ERROR - error)
                 + KEYFRAME_WEIGHT * self._alpha * keep)

@@ -21,7 +21,7 @@ from kfvo_ros.camera import Camera
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.images import to_grey
 from kfvo_ros.sequences.base import Frame
-from kfvo_ros.tracking import Tracker
+from kfvo_ros.tracking import FEATURES, Tracker
 
 THUMBNAIL = (8, 6)
 MIN_TRACKS = 12
@@ -33,10 +33,10 @@ HELD_PARALLAX = 1.0
 class GeometricStream(Stream):
     """Tracks of one sequence."""
 
-    def __init__(self, camera: Camera, seed: int) -> None:
+    def __init__(self, camera: Camera, seed: int, features: int) -> None:
         self.camera = camera
         self.initialiser = Initialiser(0.5 * (camera.fx + camera.fy), seed)
-        self._tracker = Tracker(camera, seed=seed)
+        self._tracker = Tracker(camera, features, seed)
         self._shutter = RollingShutter(camera)
         self._count = 0
 
@@ -55,7 +55,10 @@ class GeometricStream(Stream):
 
 
 class GeometricBackbone(Backbone):
-    """Needs a calibrated camera; poses come with points, so scale is aligned by depth."""
+    """Needs a calibrated camera; poses come with points, so scale is aligned by depth.
+
+    It follows up to so many `features` per frame.
+    """
 
     name = 'geometric'
     descriptor_size = THUMBNAIL[0] * THUMBNAIL[1]
@@ -63,8 +66,8 @@ class GeometricBackbone(Backbone):
     default_scale_rule = 'depth'
     unit = "the first scene's median depth"
 
-    def __init__(self, seed: int = 0) -> None:
-        self._seed = seed
+    def __init__(self, seed: int = 0, features: int = FEATURES) -> None:
+        self._seed, self._features = seed, features
         kernels.load()
 
     def open(self, camera: Camera | None) -> GeometricStream:
@@ -72,7 +75,7 @@ class GeometricBackbone(Backbone):
         if camera is None:
             raise KfvoError('the geometric backbone needs a calibrated camera, none came; give '
                             'a camera_info.yaml')
-        return GeometricStream(camera, self._seed)
+        return GeometricStream(camera, self._seed, self._features)
 
     def estimate(self, windows: Sequence[Window]) -> list[Estimate]:
         """Solve each window."""

@@ -1,0 +1,134 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""From names of sequences to episodes without end, and to an environment that steps them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from stable_baselines3.common.vec_env.base_vec_env import VecEnv
+
+from kfvo_ros import assembly
+from kfvo_ros.backbones.base import Backbone
+from kfvo_ros.errors import KfvoError
+from kfvo_ros.keyframes.learned import Setting
+from kfvo_ros.keyframes.observation import indices_of
+from kfvo_ros.keyframes.rail import Rail
+from kfvo_ros.learning.augmentation import Augmentation
+from kfvo_ros.learning.environment import KeyframeEnvironment
+from kfvo_ros.learning.episode import Episode
+from kfvo_ros.learning.library import Library
+from kfvo_ros.learning.local_reward import LocalReward
+from kfvo_ros.learning.reward import PaperReward, Reward
+from kfvo_ros.learning.workers import Workers
+from kfvo_ros.options import OdometryOptions, SequenceOptions, VggtOptions
+
+LEAST_LEFT = 120
+"""An episode begins anywhere but in so many last frames of a drive."""
+
+Pupil = tuple[tuple[str, ...], np.random.SeedSequence]
+"""One episode at a time: the sequences it takes turns in, and its dice."""
+
+
+@dataclass(frozen=True)
+class Lesson:
+    """What is learned from, and how: all that a process needs to make episodes.
+
+    ``tracks`` per frame are fewer than in use, for speed. A sequence has so many ``variants``,
+    tracked once and kept in the folder ``cache``. ``without`` names parts of the observation
+    that are not seen. ``reward`` is ``paper`` or ``local``, over ``span`` frames, and ``alpha``
+    what a keyframe is worth in it.
+    """
+
+    sequences: tuple[str, ...]
+    reading: SequenceOptions = SequenceOptions()
+    odometry: OdometryOptions = OdometryOptions()
+    vggt: VggtOptions = VggtOptions()
+    augmentation: Augmentation = Augmentation()
+    variants: int = 4
+    tracks: int = 150
+    reward: str = 'local'
+    span: int = 100
+    alpha: float = 0.0
+    rail: Rail = Rail()
+    without: tuple[str, ...] = ()
+    cache: Path | None = None
+
+    def backbone(self) -> Backbone:
+        """Return the backbone to learn with; raises KfvoError."""
+        if self.odometry.backbone == 'geometric':
+            from kfvo_ros.backbones.geometric.backbone import GeometricBackbone
+            return GeometricBackbone(self.odometry.seed, self.tracks)
+        return assembly.make_backbone(self.odometry, self.vggt)
+
+    def new_reward(self) -> Reward:
+        """Return the reward of one episode."""
+        if self.reward == 'paper':
+            return PaperReward(self.alpha)
+        return LocalReward(self.span, self.alpha)
+
+    def setting(self, backbone: Backbone) -> Setting:
+        """Return the setting of the policy, with what it sees; raises KfvoError."""
+        present = assembly.setting_of(self.odometry, backbone)
+        parts = [name for name, _ in present.observation]
+        seen = tuple(part for part in present.observation if part[0] not in self.without)
+        if not set(self.without) <= set(parts) or not seen:
+            raise KfvoError(f'expected some parts of the observation ({", ".join(parts)}) to be '
+                            f'left out, came {", ".join(self.without)}')
+        return Setting(present.backbone, present.scale_rule, present.window_size, seen)
+
+
+class School:
+    """One process's backbone and drives, and the episodes it makes of them."""
+
+    def __init__(self, lesson: Lesson) -> None:
+        self._lesson = lesson
+        self._backbone = lesson.backbone()
+        self._setting = lesson.setting(self._backbone)
+        self._library = Library(
+            self._backbone, lesson.reading, {'seed': lesson.odometry.seed,
+                                             'tracks': lesson.tracks},
+            lesson.cache, live=lesson.odometry.backbone != 'geometric')
+
+    def environment(self, pupils: Sequence[Pupil]) -> KeyframeEnvironment:
+        """Return an environment that steps one episode of each at a time."""
+        present = assembly.setting_of(self._lesson.odometry, self._backbone)
+        return KeyframeEnvironment(
+            self._backbone, [self._episodes(*pupil) for pupil in pupils],
+            indices_of(self._setting.observation, present.observation))
+
+    def _episodes(self, sequences: tuple[str, ...],
+                  seed: np.random.SeedSequence) -> Iterator[Episode]:
+        """Yield episodes for ever: each sequence in turn, in a variant, from somewhere on."""
+        lesson, dice = self._lesson, np.random.default_rng(seed)
+        while True:
+            for text in dice.permutation(sequences):
+                drive = self._library.variant(str(text), lesson.augmentation,
+                                              int(dice.integers(lesson.variants)))
+                start = int(dice.integers(max(1, len(drive) - LEAST_LEFT)))
+                yield Episode(drive.since(start), self._backbone, self._setting.scale_rule,
+                              self._setting.window_size, lesson.rail, lesson.new_reward())
+
+
+def make_environment(lesson: Lesson, environments: int, workers: int, seed: int) -> VecEnv:
+    """Return so many episodes at once, stepped by so many processes; raises KfvoError.
+
+    How many workers there are changes nothing but the time; one is this process itself.
+    """
+    seeds = np.random.SeedSequence(seed).spawn(environments)
+    count = len(lesson.sequences)
+    pupils: list[Pupil] = [(lesson.sequences[number % count::environments], seeds[number])
+                           for number in range(environments)]
+    classes = [pupils[part[0]:part[-1] + 1]
+               for part in np.array_split(np.arange(environments), min(workers, environments))]
+    if len(classes) == 1:
+        return School(lesson).environment(pupils)
+    return Workers([partial(_open, lesson, each) for each in classes])
+
+
+def _open(lesson: Lesson, pupils: list[Pupil]) -> KeyframeEnvironment:
+    return School(lesson).environment(pupils)

@@ -1,0 +1,48 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The reward that looks at a stretch of the trajectory."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kfvo_ros import geometry
+from kfvo_ros.learning.local_reward import LEAST_SPAN, MOST, LocalReward
+
+FRAMES = 100
+
+
+def walk(frames: int = FRAMES) -> np.ndarray:
+    steps = np.random.default_rng(2).normal(0.1, 0.05, (frames, 3))
+    return geometry.make_transform(np.tile(np.eye(3), (frames, 1, 1)), steps.cumsum(axis=0))
+
+
+def drifting(truth: np.ndarray, drift: float) -> np.ndarray:
+    """Return the walk in another world, its steps longer and longer."""
+    steps = np.diff(truth[:, :3, 3], axis=0, prepend=0.0)
+    grown = steps * np.exp(np.linspace(0.0, drift, len(steps)))[:, None]
+    return geometry.make_transform(truth[:, :3, :3],
+                                   3.0 * grown.cumsum(axis=0) @ geometry.exp_so3([1.0, 0.2, 0.3]))
+
+
+def test_drift_of_scale_is_charged_on_a_log_scale():
+    truth, reward = walk(), LocalReward(FRAMES)
+    worths = [reward(drifting(truth, drift), truth, True) for drift in (0.1, 0.2, 0.4)]
+    assert worths[0] > worths[1] > worths[2]
+    assert worths[0] - worths[1] == pytest.approx(np.log(2.0), abs=0.1)
+
+
+def test_it_is_bounded_and_right_or_wrong_alike():
+    truth, reward = walk(), LocalReward(FRAMES)
+    assert reward(truth, truth, True) == MOST
+    assert reward(drifting(truth, 20.0), truth, True) == -MOST
+    at_rest = np.tile(np.eye(4), (FRAMES, 1, 1))
+    assert reward(at_rest, at_rest, False) == MOST
+    assert reward(at_rest, truth, False) == -MOST
+
+
+def test_a_window_s_length_says_nothing():
+    truth, reward = walk(LEAST_SPAN - 1), LocalReward(FRAMES, alpha=-0.25)
+    assert reward(drifting(truth, 5.0), truth, False) == 0.0
+    assert reward(drifting(truth, 5.0), truth, True) == -0.25
