@@ -37,12 +37,13 @@ PYTHON := $(shell for python in $(CANDIDATES); do \
 	$$python -c '$(SUPPORTED)' 2>/dev/null && echo $$python && break; done)
 endif
 
-.PHONY: help demo bench-node test lint clean
+.PHONY: help demo bench-node bench-train test lint clean
 
 help:
 	@echo 'make demo    a rendered sequence through kfvo_node, over DDS, into demo/'
 	@echo 'make test    install into $(VENV) and run ruff and the tests'
 	@echo 'make bench-node   a minute of 752x480 at 20 Hz, then at twice what the node can take'
+	@echo 'make bench-train  decisions per second of the environment, and of PPO'
 	@echo 'make lint    ruff and mypy'
 	@echo 'make clean   remove the environments and all that was built'
 	@echo
@@ -55,6 +56,9 @@ demo: $(INSTALLED)
 
 bench-node: $(INSTALLED)
 	$(VENV)/bin/python -m kfvo_ros.node_benchmark
+
+bench-train: $(TOOLS)
+	$(VENV)/bin/python -m kfvo_ros.learning.benchmark
 
 test: $(TOOLS)
 	$(VENV)/bin/ruff check .

@@ -59,8 +59,8 @@ def run_command(command: str, body: Callable[[list[str]], None], argv: list[str]
 def not_in_this_version() -> int:
     """Say on stderr that the command called is still to come; return exit status 1."""
     command = Path(sys.argv[0]).name
-    print(f'{command} is not part of kfvo_ros {__version__}; kfvo_run, kfvo_node, kfvo_convert '
-          'and kfvo_play are', file=sys.stderr)
+    print(f'{command} is not part of kfvo_ros {__version__}; kfvo_run, kfvo_node, kfvo_convert, '
+          'kfvo_play and kfvo_train are', file=sys.stderr)
     return 1
 
 

@@ -15,6 +15,9 @@ from kfvo_ros.scale import SCALE_RULES
 
 Options = TypeVar('Options')
 
+REWARDS = ('local', 'paper')
+"""What a decision can be worth in training."""
+
 
 def option(default: Any, description: str, choices: tuple[str, ...] = (),
            least: float | None = None, most: float | None = None, bare: Any = None,
@@ -105,10 +108,33 @@ class PlayOptions:
         '1 without a value', least=1, bare=1)
 
 
-def add_arguments(parser: argparse.ArgumentParser, options: type[Any]) -> None:
-    """Add one ``--name`` for each field of an options dataclass."""
+@dataclass(frozen=True)
+class TrainOptions:
+    """How a policy is trained."""
+
+    recipe: str = option('train.yaml', 'every number of the training: a YAML file, or the name '
+                         'of one in config/')
+    steps: int | None = option(None, "decisions to learn from; default the recipe's", least=1)
+    reward: str | None = option(None, "what a decision is worth; default the recipe's", REWARDS)
+    environments: int | None = option(
+        None, "episodes that are driven side by side; default the recipe's", least=1, most=1000)
+    workers: int = option(1, 'processes that drive them', least=1, most=256)
+    cache: str | None = option(
+        None, 'folder that keeps what the backbone made of the training sequences; default: none '
+        'is kept')
+    resume: bool = option(False, 'go on from the checkpoint beside --output')
+    overwrite: bool = option(False, 'begin anew where there is a policy or a checkpoint')
+    smoke: bool = option(False, 'try everything in a minute, on short rendered sequences unless '
+                         'others are named')
+
+
+def add_arguments(parser: argparse.ArgumentParser, options: type[Any],
+                  without: tuple[str, ...] = ()) -> None:
+    """Add one ``--name`` for each field of an options dataclass, `without` some of them."""
     group = parser.add_argument_group((options.__doc__ or '').splitlines()[0].rstrip('.'))
     for declared in fields(options):
+        if declared.name in without:
+            continue
         meta = declared.metadata
         about: dict[str, Any] = {'help': meta['description'], 'default': declared.default}
         if isinstance(declared.default, bool):
@@ -128,8 +154,8 @@ def add_arguments(parser: argparse.ArgumentParser, options: type[Any]) -> None:
 
 
 def from_arguments(options: type[Options], arguments: argparse.Namespace) -> Options:
-    """Build the dataclass from parsed arguments."""
-    values = {declared.name: getattr(arguments, declared.name)
+    """Build the dataclass from parsed arguments; what was left out is the default."""
+    values = {declared.name: getattr(arguments, declared.name, None)
               for declared in fields(options)}  # type: ignore[arg-type]
     return options(**{name: tuple(value) if isinstance(value, list) else value
                       for name, value in values.items() if value is not None})

@@ -13,7 +13,8 @@ PIP_NAMES = {'cv2': 'opencv-python-headless', 'mcap': 'mcap', 'numba': 'numba',
 """The modules of setup.py's install_requires, by the name they are imported under."""
 
 OPTIONAL_PIP_NAMES = {'matplotlib': 'matplotlib', 'torch': 'torch', 'PIL': 'pillow',
-                      'huggingface_hub': 'huggingface-hub'}
+                      'huggingface_hub': 'huggingface-hub', 'gymnasium': 'gymnasium',
+                      'stable_baselines3': 'stable-baselines3', 'tensorboard': 'tensorboard'}
 """Modules that one command needs: an extra of setup.py brings them."""
 
 ROS_MODULES = frozenset(('rclpy', 'rcl_interfaces', 'rosgraph_msgs', 'sensor_msgs', 'nav_msgs',

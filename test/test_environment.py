@@ -139,11 +139,11 @@ def test_the_critic_is_told_true_motions_in_the_trajectory_s_unit(backbone, driv
     assert np.ptp(scales) < 1e-4 * scales[0]  # metres per unit of the trajectory
     for true, motion in zip(true_motions, motions):
         np.testing.assert_allclose(motion[:3, :3], true[:3, :3], atol=1e-6)
-    assert told[-1] == 0.0
+    assert told[21] == told[22] == 0.0
     for _ in range(FRAMES - 8):
-        observations, *_ = environment.step(np.array([0]))
+        observations, rewards, *_ = environment.step(np.array([0]))
     end = observations[PRIVILEGED][0]
-    assert end[-1] == 1.0 and not end[7:21].any() and end[:7].any()
+    assert end[21] == 1.0 and end[22] == rewards[0] and not end[7:21].any() and end[:7].any()
 
 
 def test_where_the_rail_decides_nobody_is_asked(backbone, drives):

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
 from kfvo_ros import assembly
@@ -18,7 +19,7 @@ from kfvo_ros.keyframes.base import DecisionInput
 from kfvo_ros.keyframes.learned import CLIP, Actor, Layer, Learned, Setting
 from kfvo_ros.keyframes.observation import indices_of, layout_of
 from kfvo_ros.keyframes.policy_file import KEY, PolicyFile, read_policy
-from kfvo_ros.keyframes.rail import Rail
+from kfvo_ros.keyframes.rail import NO_RAIL, Rail
 from kfvo_ros.options import OdometryOptions, VggtOptions
 from kfvo_ros.sequences.synthetic import SyntheticSequence
 from kfvo_ros.tracking import Tracks
@@ -26,14 +27,12 @@ from kfvo_ros.tracking import Tracks
 LAYOUT = layout_of(48, 8, ('near', 'far'))
 SIZE = 48 + 49 + 2
 SETTING = Setting('geometric', 'depth', 8, LAYOUT)
-NO_RAIL = Rail(min_survival=0.0, max_gap=10 ** 6, min_flow=0.0)
 
 
 def actor(size: int = SIZE, seed: int = 0) -> Actor:
     random = np.random.default_rng(seed)
     sizes = [size, 256, 256, 2]
-    return Actor(random.normal(size=size).astype(np.float32),
-                 random.uniform(0.5, 2.0, size).astype(np.float32),
+    return Actor(random.normal(size=size), random.uniform(0.5, 2.0, size),
                  tuple(Layer(random.normal(0.0, last ** -0.5, (out, last)).astype(np.float32),
                              random.normal(size=out).astype(np.float32))
                        for last, out in zip(sizes, sizes[1:])))
@@ -55,14 +54,14 @@ def test_the_network_is_the_one_that_torch_runs():
     network = torch.nn.Sequential(steps[0], torch.nn.ReLU(), steps[1], torch.nn.ReLU(), steps[2])
     seen = np.random.default_rng(1).normal(0.0, 8.0, (1000, SIZE)).astype(np.float32)
     standard = ((torch.tensor(seen) - torch.tensor(numbers.mean)) / torch.tensor(numbers.std))
-    expected = network(standard.clamp(-CLIP, CLIP)).detach().numpy()
+    expected = network(standard.clamp(-CLIP, CLIP).float()).detach().numpy()
     assert np.abs(numbers.logits(seen) - expected).max() < 1e-5 * np.abs(expected).max()
     assert (np.abs(standard.numpy()) > CLIP).any()
 
 
 def test_a_tie_keeps_and_the_greater_preference_decides():
     dead = Layer(np.zeros((2, SIZE), np.float32), np.zeros(2, np.float32))
-    blank = Actor(np.zeros(SIZE, np.float32), np.ones(SIZE, np.float32), (dead,))
+    blank = Actor(np.zeros(SIZE), np.ones(SIZE), (dead,))
     everything = np.arange(SIZE)
     observation = np.ones(SIZE, np.float32)
     assert Learned(blank, NO_RAIL, everything).decide(decision(observation))
@@ -92,6 +91,25 @@ def test_without_tracks_the_rail_knows_the_gap_only():
     bare = DecisionInput(np.zeros(SIZE), Tracks(), Tracks(), 39)
     assert Rail().forced(bare) is None
     assert Rail().forced(replace(bare, gap=40)) is True
+
+
+def test_no_rail_forces_nothing():
+    assert not NO_RAIL.needs_tracks
+    for change in ({'survivors': 0}, {'gap': 10 ** 9}, {'flow': 0.0}):
+        assert NO_RAIL.forced(decision(np.zeros(SIZE), **change)) is None
+    left = Rail().without_tracks()
+    assert not left.needs_tracks and left.forced(decision(np.zeros(SIZE), survivors=0)) is None
+    assert left.forced(decision(np.zeros(SIZE), gap=40)) is True
+    nothing = indices_of(LAYOUT, LAYOUT)
+    assert Learned(actor(), Rail(), nothing).needs_tracks
+    assert not Learned(actor(), left, nothing).needs_tracks
+
+
+@pytest.mark.parametrize('wrong', [{'min_survival': 1.1}, {'max_gap': 0}, {'min_flow': -1.0},
+                                   {'min_flow': float('nan')}])
+def test_an_impossible_rail_is_refused(wrong):
+    with pytest.raises(ValueError, match='expected a min_survival of 0 to 1'):
+        Rail(**wrong)
 
 
 def test_a_file_holds_all_of_a_policy(tmp_path: Path):
@@ -130,6 +148,10 @@ def damage(path: Path, how: str) -> None:
         save_file(tensors, path, {KEY: '{'})
     elif how == 'later version':
         save_file(tensors, path, {KEY: json.dumps({'format_version': 2})})
+    elif how == 'impossible rail':
+        with safe_open(path, 'np') as file:
+            words = json.loads(file.metadata()[KEY])
+        save_file(tensors, path, {KEY: json.dumps(words | {'rail': {'max_gap': 'wide'}})})
     elif how == 'not finite':
         replace(good, actor=replace(good.actor, mean=np.full(SIZE, np.nan))).write(path)
     elif how == 'no spread':
@@ -142,6 +164,7 @@ def damage(path: Path, how: str) -> None:
 
 @pytest.mark.parametrize('how', [
     'cut', 'text', 'other tensors', 'half a head', 'no json', 'later version', 'not finite',
+    'impossible rail',
     'no spread', 'wrong size', 'no layers'])
 def test_a_bad_file_is_one_clear_line(how, tmp_path: Path):
     path = tmp_path / 'policy.safetensors'

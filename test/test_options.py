@@ -17,6 +17,7 @@ from kfvo_ros.options import (
     OdometryOptions,
     PlayOptions,
     SequenceOptions,
+    TrainOptions,
     VggtOptions,
     add_arguments,
     from_arguments,
@@ -32,6 +33,9 @@ OTHER = {
     SequenceOptions: SequenceOptions(kind='tum', camera='a b.yaml', image_topic='/cam0/image',
                                      ground_truth_topic='/vicon',
                                      ground_truth_to_camera='0 0 0 0 0 0 1', rate=29.97, stop=3),
+    TrainOptions: TrainOptions(recipe='own.yaml', steps=7, reward='paper', environments=3,
+                               workers=2, cache='a folder', resume=True, overwrite=True,
+                               smoke=True),
 }
 
 
@@ -129,6 +133,14 @@ def test_help_describes_each_option():
         assert ' '.join(declared.metadata['description'].split()) in text
     assert '(default: 0.8)' in text
     assert all(name in text for name in (*POLICIES, *SCALE_RULES))
+
+
+def test_what_is_left_out_is_no_option_and_keeps_its_default():
+    parser = argparse.ArgumentParser()
+    add_arguments(parser, OdometryOptions, without=('keyframes', 'policy'))
+    assert '--keyframes' not in parser.format_help() and '--seed' in parser.format_help()
+    options = from_arguments(OdometryOptions, parser.parse_args(['--seed', '5']))
+    assert options == OdometryOptions(seed=5)
 
 
 def test_options_cannot_be_changed():

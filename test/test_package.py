@@ -28,7 +28,8 @@ ROOT = Path(__file__).resolve().parent.parent
 SOURCES = sorted((ROOT / 'kfvo_ros').rglob('*.py'))
 COMMANDS = {'kfvo_node', 'kfvo_run', 'kfvo_convert', 'kfvo_play', 'kfvo_train', 'kfvo_benchmark'}
 BUILT_COMMANDS = {'kfvo_run': 'synthetic:SEED', 'kfvo_convert': '--compressed',
-                  'kfvo_play': '--wait-for-subscribers', 'kfvo_node': 'camera_info_file'}
+                  'kfvo_play': '--wait-for-subscribers', 'kfvo_node': 'camera_info_file',
+                  'kfvo_train': '--validation'}
 HEADER = ['# Copyright 2026 The kfvo_ros authors', '# SPDX-License-Identifier: Apache-2.0']
 BUILT = ('.git', '.venv*', '*.egg-info', '__pycache__', '.*_cache', 'build', 'install', 'log',
          'demo')
@@ -38,7 +39,8 @@ FLOORS = ((), ('sequences',), ('backbones',), ('keyframes',), ('knowledge', 'odo
           ('assembly', 'body', 'live', 'options', 'plots', 'recording', 'results'),
           ('learning', 'ros'),
           ('rehearsal',),
-          ('convert', 'demo', 'node', 'node_benchmark', 'play', 'run'))
+          ('convert', 'demo', 'node', 'node_benchmark', 'play', 'run', 'train'),
+          ('ablation',))
 HEAVY = ('rclpy', 'torch', 'scipy', 'stable_baselines3')
 MAY_BE_HEAVY = ('kfvo_ros.ros', 'kfvo_ros.learning', 'kfvo_ros.backbones.vggt')
 
@@ -194,7 +196,7 @@ def test_every_requirement_has_a_pip_line_and_a_pin(
     needed = {re.match(r'[\w.-]+', line)[0] for line in requires if 'extra ==' not in line}
     assert needed == set(PIP_NAMES.values())
     extra = {re.match(r'[\w.-]+', line)[0].replace('_', '-') for line in requires
-             if re.search(r'extra == .(vggt|demo).', line)}
+             if re.search(r'extra == .(vggt|demo|train).', line)}
     assert extra == set(OPTIONAL_PIP_NAMES.values())
     named = {re.sub(r'[-_.]+', '-', re.match(r'[\w.-]+', line)[0]).lower() for line in requires}
     for file in ('constraints.txt', 'constraints-jazzy.txt'):
@@ -228,7 +230,7 @@ def test_command_to_come_says_so(workspace: Path, command: str) -> None:
     outcome = start(workspace, command)
     assert outcome.returncode == 1
     assert outcome.stderr == (f'{command} is not part of kfvo_ros {kfvo_ros.__version__}; '
-                              'kfvo_run, kfvo_node, kfvo_convert and kfvo_play are\n')
+                              'kfvo_run, kfvo_node, kfvo_convert, kfvo_play and kfvo_train are\n')
 
 
 # Files

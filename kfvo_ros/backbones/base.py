@@ -148,6 +148,7 @@ class Backbone(ABC):
 
     name: str
     needs_camera: bool = True
+    offers_tracks: bool = False
     descriptor_size: int
     signal_names: tuple[str, ...] = ()
     default_scale_rule: str = 'translation'

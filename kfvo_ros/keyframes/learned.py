@@ -28,7 +28,11 @@ class Layer:
 
 @dataclass(frozen=True)
 class Actor:
-    """Observation to preference: standardised by ``mean`` and ``std`` (D,), then ReLU layers."""
+    """Observation to preference: standardised by ``mean`` and ``std`` (D,), then ReLU layers.
+
+    ``mean`` and ``std`` are float64: of numbers that hardly vary float32 would lose what they
+    vary by.
+    """
 
     mean: np.ndarray
     std: np.ndarray
@@ -76,10 +80,10 @@ class Learned(KeyframePolicy):
     """
 
     name = 'learned'
-    needs_tracks = True
 
     def __init__(self, actor: Actor, rail: Rail, indices: np.ndarray) -> None:
         self._actor, self._rail, self._indices = actor, rail, indices
+        self.needs_tracks = rail.needs_tracks
 
     def decide(self, decision: DecisionInput) -> bool:
         """Ask the rail, then the network."""

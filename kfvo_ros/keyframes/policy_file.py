@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save_file
+from safetensors.numpy import save
 
+from kfvo_ros.atomic import replaced
 from kfvo_ros.errors import KfvoError, reason_of
 from kfvo_ros.keyframes.learned import DROP, KEEP, Actor, Layer, Learned, Setting
 from kfvo_ros.keyframes.observation import indices_of
@@ -38,7 +39,7 @@ class PolicyFile:
                        indices_of(self.setting.observation, present.observation))
 
     def write(self, path: Path) -> None:
-        """Write the file; raises KfvoError."""
+        """Write the file, in place of an older one at once; raises KfvoError."""
         tensors = {'mean': self.actor.mean, 'std': self.actor.std}
         for number, layer in enumerate(self.actor.layers):
             tensors |= {f'layers.{number}.weight': layer.weight,
@@ -46,8 +47,10 @@ class PolicyFile:
         head = {'format_version': FORMAT_VERSION, 'setting': asdict(self.setting),
                 'rail': asdict(self.rail), 'training': self.training}
         try:
-            save_file({name: np.ascontiguousarray(each, dtype=np.float32)
-                       for name, each in tensors.items()}, path, {KEY: json.dumps(head)})
+            with replaced(path) as draft:
+                draft.write_bytes(save({name: np.ascontiguousarray(each)
+                                        for name, each in tensors.items()},
+                                       {KEY: json.dumps(head)}))
         except (OSError, SafetensorError) as error:
             raise KfvoError(f'cannot write the policy {path}: {reason_of(error)}') from error
 
@@ -81,7 +84,8 @@ def _policy(head: dict[str, Any], tensors: dict[str, np.ndarray]) -> PolicyFile:
     while f'layers.{len(layers)}.weight' in tensors:
         prefix = f'layers.{len(layers)}'
         layers.append(Layer(tensors[f'{prefix}.weight'], tensors[f'{prefix}.bias']))
-    actor = Actor(tensors['mean'], tensors['std'], tuple(layers))
+    actor = Actor(tensors['mean'].astype(np.float64), tensors['std'].astype(np.float64),
+                  tuple(layers))
     _check(actor, sum(size for _, size in observation))
     return PolicyFile(actor, Rail(**head['rail']), Setting(**setting, observation=observation),
                       head['training'])
@@ -89,9 +93,9 @@ def _policy(head: dict[str, Any], tensors: dict[str, np.ndarray]) -> PolicyFile:
 
 def _check(actor: Actor, size: int) -> None:
     """Raise ValueError unless observations of `size` go through to two finite preferences."""
-    arrays = [actor.mean, actor.std, *(part for layer in actor.layers
-                                       for part in (layer.weight, layer.bias))]
-    if any(array.dtype != np.float32 or not np.isfinite(array).all() for array in arrays) \
+    weights = [part for layer in actor.layers for part in (layer.weight, layer.bias)]
+    if any(array.dtype != np.float32 for array in weights) \
+            or not all(np.isfinite(array).all() for array in (*weights, actor.mean, actor.std)) \
             or not (actor.std > 0.0).all():
         raise ValueError('finite float32 numbers and a positive std are needed')
     sizes = [size, *(len(layer.bias) for layer in actor.layers)]

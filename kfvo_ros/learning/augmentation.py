@@ -35,10 +35,11 @@ class Augmentation:
 
 
 class Variant(Sequence):
-    """One variant of a sequence: the same numbers, the same variant."""
+    """One variant of a sequence, of its first `stop` frames: the same number, the same variant."""
 
-    def __init__(self, sequence: Sequence, augmentation: Augmentation, number: int) -> None:
-        self._sequence, self._frames = sequence, augmentation.frames
+    def __init__(self, sequence: Sequence, augmentation: Augmentation, number: int,
+                 stop: int | None = None) -> None:
+        self._sequence, self._frames, self._stop = sequence, augmentation.frames, stop
         self._rng_seed = (number, zlib.crc32(sequence.name.encode()))
         dice = np.random.default_rng(self._rng_seed)
         self.name = f'{sequence.name} variant {number}'
@@ -47,7 +48,8 @@ class Variant(Sequence):
             augmentation.brightness, augmentation.contrast, augmentation.saturation)]
         self._drop_share = dice.uniform(0.0, augmentation.drop_share)
         self._stride = int(dice.integers(1, augmentation.max_stride, endpoint=True))
-        spare = (sequence.length or 0) - augmentation.frames * self._stride
+        length = sequence.length or 0 if stop is None else min(stop, sequence.length or stop)
+        spare = length - augmentation.frames * self._stride
         self._start = int(dice.integers(0, max(spare, 0), endpoint=True))
         # What a rolling shutter did cannot be read backwards.
         rolling = sequence.camera is not None and sequence.camera.readout_s > 0.0
@@ -56,7 +58,7 @@ class Variant(Sequence):
     def __iter__(self) -> Iterator[Frame]:
         """Yield the frames; of a variant that runs backwards all images are held."""
         dice = np.random.default_rng((*self._rng_seed, 1))
-        seen = islice(self._sequence, self._start, None, self._stride)
+        seen = islice(self._sequence, self._start, self._stop, self._stride)
         frames: Iterator[Frame] = islice(
             (frame for frame in seen if dice.random() >= self._drop_share), self._frames)
         if self._backwards:

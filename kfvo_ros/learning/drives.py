@@ -13,7 +13,7 @@ import numpy as np
 from kfvo_ros.backbones.base import Backbone, Encoded
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.sequences.base import Frame, Sequence
-from kfvo_ros.trajectory import associate
+from kfvo_ros.trajectory import Trajectory, associate
 
 NO_IMAGE = np.zeros((0, 0), dtype=np.uint8)
 
@@ -46,15 +46,23 @@ def record(sequence: Sequence, backbone: Backbone | None, stop: int | None = Non
     Frames without ground truth within 10 ms are left out. Raises KfvoError for a sequence whose
     true camera poses are not known.
     """
-    truth = sequence.ground_truth()
-    if truth is None or truth.frame != 'camera' or not truth.trajectory.has_rotation:
-        raise KfvoError(f'{sequence.name}: expected ground truth of the camera to learn from, '
-                        + ('none came' if truth is None else f'that of {truth.frame} came'))
+    truth = true_trajectory(sequence)
     seen = list(_seen(islice(sequence, stop), sequence, backbone))
     stamps_ns = np.array([frame.stamp_ns for frame, _ in seen], dtype=np.int64)
-    matched, nearest = associate(stamps_ns, truth.trajectory.stamps_ns)
+    matched, nearest = associate(stamps_ns, truth.stamps_ns)
     return Drive(sequence.name, tuple(seen[index][0] for index in matched),
-                 tuple(seen[index][1] for index in matched), truth.trajectory.poses[nearest])
+                 tuple(seen[index][1] for index in matched), truth.poses[nearest])
+
+
+def true_trajectory(sequence: Sequence) -> Trajectory:
+    """Return where the camera truly was; raises KfvoError where that is not known."""
+    truth = sequence.ground_truth()
+    if truth is None or truth.frame != 'camera' or not truth.trajectory.has_rotation:
+        came = 'none' if truth is None else f'that of {truth.frame}' + (
+            '' if truth.trajectory.has_rotation else ' without rotations')
+        raise KfvoError(f'{sequence.name}: expected ground truth of the camera to learn from, '
+                        f'{came} came')
+    return truth.trajectory
 
 
 def _seen(frames: Iterator[Frame], sequence: Sequence,

@@ -21,8 +21,8 @@ def export_actor(policy: PrivilegedCritic, seen: RunningMeanStd, epsilon: float)
     assert isinstance(networks, TwoNetworks)
     steps = [*networks.actor, policy.action_net]
     return Actor(
-        np.asarray(seen.mean, dtype=np.float32),
-        np.sqrt(np.asarray(seen.var) + epsilon).astype(np.float32),
+        np.asarray(seen.mean, dtype=np.float64),
+        np.sqrt(np.asarray(seen.var, dtype=np.float64) + epsilon),
         tuple(Layer(step.weight.detach().cpu().numpy().copy(),
                     step.bias.detach().cpu().numpy().copy())
               for step in steps if isinstance(step, nn.Linear)))

@@ -68,9 +68,11 @@ class Library:
 
     def _record(self, text: str, augmentation: Augmentation | None, number: int) -> Drive:
         sequence: Sequence = assembly.make_sequence(text, self.reading)
-        if augmentation is not None:
-            sequence = Variant(sequence, augmentation, number)
-        drive = record(sequence, None if self.live else self.backbone, self.reading.stop)
+        backbone, stop = None if self.live else self.backbone, self.reading.stop
+        if augmentation is None:
+            drive = record(sequence, backbone, stop)
+        else:
+            drive = record(Variant(sequence, augmentation, number, stop), backbone)
         if len(drive) < LEAST_FRAMES:
             raise KfvoError(f'{sequence.name}: expected at least {LEAST_FRAMES} frames with '
                             f'ground truth to learn from, came {len(drive)}')

@@ -9,7 +9,7 @@ import numpy as np
 from kfvo_ros import geometry
 from kfvo_ros.learning.reward import Reward
 
-LEAST_SPAN = 40
+LEAST_SPAN = 100
 """Fewer frames say more of the noise in a pose than of what keyframes do to a trajectory."""
 ACCEPTED_SHARE, ACCEPTED_M = 3e-3, 2e-3
 """An error of this share of the path and so many metres is worth nothing, good or bad ..."""
@@ -21,7 +21,7 @@ class LocalReward(Reward):
     """The error of the last `span` frames' positions after Sim(3) alignment, on a log scale.
 
     A window is blind to the drift of scale between windows, which is nearly all of the error of
-    a trajectory; stretches of a hundred frames see it. `alpha` is added for a keyframe.
+    a trajectory; stretches of some hundred frames see it. `alpha` is added for a keyframe.
     """
 
     def __init__(self, span: int, alpha: float = 0.0) -> None:

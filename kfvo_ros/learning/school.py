@@ -14,11 +14,10 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
 from kfvo_ros import assembly
 from kfvo_ros.backbones.base import Backbone
-from kfvo_ros.errors import KfvoError
-from kfvo_ros.keyframes.learned import Setting
-from kfvo_ros.keyframes.observation import indices_of
+from kfvo_ros.keyframes.observation import Layout, indices_of
 from kfvo_ros.keyframes.rail import Rail
 from kfvo_ros.learning.augmentation import Augmentation
+from kfvo_ros.learning.drives import true_trajectory
 from kfvo_ros.learning.environment import KeyframeEnvironment
 from kfvo_ros.learning.episode import Episode
 from kfvo_ros.learning.library import Library
@@ -27,7 +26,7 @@ from kfvo_ros.learning.reward import PaperReward, Reward
 from kfvo_ros.learning.workers import Workers
 from kfvo_ros.options import OdometryOptions, SequenceOptions, VggtOptions
 
-LEAST_LEFT = 120
+LEAST_LEFT = 150
 """An episode begins anywhere but in so many last frames of a drive."""
 
 Pupil = tuple[tuple[str, ...], np.random.SeedSequence]
@@ -39,9 +38,9 @@ class Lesson:
     """What is learned from, and how: all that a process needs to make episodes.
 
     ``tracks`` per frame are fewer than in use, for speed. A sequence has so many ``variants``,
-    tracked once and kept in the folder ``cache``. ``without`` names parts of the observation
-    that are not seen. ``reward`` is ``paper`` or ``local``, over ``span`` frames, and ``alpha``
-    what a keyframe is worth in it.
+    tracked once and kept in the folder ``cache``. ``seen`` are the parts of the observation
+    that are told, None for all. ``reward`` is ``paper`` or ``local``, over ``span`` frames, and
+    ``alpha`` what a keyframe is worth in it.
     """
 
     sequences: tuple[str, ...]
@@ -55,7 +54,7 @@ class Lesson:
     span: int = 100
     alpha: float = 0.0
     rail: Rail = Rail()
-    without: tuple[str, ...] = ()
+    seen: Layout | None = None
     cache: Path | None = None
 
     def backbone(self) -> Backbone:
@@ -65,21 +64,17 @@ class Lesson:
             return GeometricBackbone(self.odometry.seed, self.tracks)
         return assembly.make_backbone(self.odometry, self.vggt)
 
+    def library(self, backbone: Backbone) -> Library:
+        """Return where the drives come from: tracked once, or held as images to be encoded."""
+        return Library(backbone, self.reading,
+                       {'seed': self.odometry.seed, 'tracks': self.tracks}, self.cache,
+                       live=not backbone.offers_tracks)
+
     def new_reward(self) -> Reward:
         """Return the reward of one episode."""
         if self.reward == 'paper':
             return PaperReward(self.alpha)
         return LocalReward(self.span, self.alpha)
-
-    def setting(self, backbone: Backbone) -> Setting:
-        """Return the setting of the policy, with what it sees; raises KfvoError."""
-        present = assembly.setting_of(self.odometry, backbone)
-        parts = [name for name, _ in present.observation]
-        seen = tuple(part for part in present.observation if part[0] not in self.without)
-        if not set(self.without) <= set(parts) or not seen:
-            raise KfvoError(f'expected some parts of the observation ({", ".join(parts)}) to be '
-                            f'left out, came {", ".join(self.without)}')
-        return Setting(present.backbone, present.scale_rule, present.window_size, seen)
 
 
 class School:
@@ -88,18 +83,14 @@ class School:
     def __init__(self, lesson: Lesson) -> None:
         self._lesson = lesson
         self._backbone = lesson.backbone()
-        self._setting = lesson.setting(self._backbone)
-        self._library = Library(
-            self._backbone, lesson.reading, {'seed': lesson.odometry.seed,
-                                             'tracks': lesson.tracks},
-            lesson.cache, live=lesson.odometry.backbone != 'geometric')
+        self._present = assembly.setting_of(lesson.odometry, self._backbone)
+        self._library = lesson.library(self._backbone)
 
     def environment(self, pupils: Sequence[Pupil]) -> KeyframeEnvironment:
         """Return an environment that steps one episode of each at a time."""
-        present = assembly.setting_of(self._lesson.odometry, self._backbone)
-        return KeyframeEnvironment(
-            self._backbone, [self._episodes(*pupil) for pupil in pupils],
-            indices_of(self._setting.observation, present.observation))
+        everything = self._present.observation
+        return KeyframeEnvironment(self._backbone, [self._episodes(*pupil) for pupil in pupils],
+                                   indices_of(self._lesson.seen or everything, everything))
 
     def _episodes(self, sequences: tuple[str, ...],
                   seed: np.random.SeedSequence) -> Iterator[Episode]:
@@ -110,15 +101,18 @@ class School:
                 drive = self._library.variant(str(text), lesson.augmentation,
                                               int(dice.integers(lesson.variants)))
                 start = int(dice.integers(max(1, len(drive) - LEAST_LEFT)))
-                yield Episode(drive.since(start), self._backbone, self._setting.scale_rule,
-                              self._setting.window_size, lesson.rail, lesson.new_reward())
+                yield Episode(drive.since(start), self._backbone, self._present.scale_rule,
+                              self._present.window_size, lesson.rail, lesson.new_reward())
 
 
 def make_environment(lesson: Lesson, environments: int, workers: int, seed: int) -> VecEnv:
     """Return so many episodes at once, stepped by so many processes; raises KfvoError.
 
-    How many workers there are changes nothing but the time; one is this process itself.
+    How many workers there are changes nothing but the time; one is this process itself. What
+    cannot be learned from, because nobody knows where its camera was, is refused at once.
     """
+    for text in lesson.sequences:
+        true_trajectory(assembly.make_sequence(text, lesson.reading))
     seeds = np.random.SeedSequence(seed).spawn(environments)
     count = len(lesson.sequences)
     pupils: list[Pupil] = [(lesson.sequences[number % count::environments], seeds[number])

@@ -62,6 +62,7 @@ class GeometricBackbone(Backbone):
 
     name = 'geometric'
     descriptor_size = THUMBNAIL[0] * THUMBNAIL[1]
+    offers_tracks = True
     signal_names = SIGNAL_NAMES
     default_scale_rule = 'depth'
     unit = "the first scene's median depth"

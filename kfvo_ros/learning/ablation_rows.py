@@ -1,0 +1,45 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The rows of the ablation: what of a recipe each of them changes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from kfvo_ros.errors import KfvoError
+from kfvo_ros.learning.recipe import Recipe
+from kfvo_ros.learning.reward import ALPHA
+
+FULL = 'full'
+VALIDATIONS = 10
+"""A learning curve has so many points or more."""
+
+_PAPER: dict[str, Any] = {'reward': 'paper', 'alpha': ALPHA, 'without': ('signals',)}
+ROWS: dict[str, dict[str, Any]] = {
+    FULL: _PAPER,
+    'without_pose': _PAPER | {'without': ('poses', 'signals')},
+    'without_descriptor': _PAPER | {'without': ('descriptor', 'signals')},
+    'without_alpha': _PAPER | {'alpha': 0.0},
+    'alpha_penalty': _PAPER | {'alpha': -ALPHA},
+    'local': {'reward': 'local'},
+    'local_signals_only': {'reward': 'local', 'without': ('descriptor', 'poses')},
+}
+"""Rows against `FULL`, which is reward and observation of the paper: the mean descriptor and the
+relative poses, not the backbone's signals; and our own reward, on all that the recipe lets it
+see, and on the signals alone."""
+
+
+def row_names(text: str) -> tuple[str, ...]:
+    """Return the rows named in ``a,b,...``, each once; raises KfvoError for any other word."""
+    names = tuple(dict.fromkeys(text.split(',')))
+    for name in names:
+        if name not in ROWS:
+            raise KfvoError(f'rows: expected names out of {", ".join(ROWS)}, came {name!r}')
+    return names
+
+
+def row_recipe(name: str, recipe: Recipe, steps: int) -> Recipe:
+    """Return the recipe of a row, of so many steps, validated often enough for a curve."""
+    every = min(recipe.validation_every, max(steps // VALIDATIONS, 1))
+    return replace(recipe, steps=steps, validation_every=every, **ROWS[name])

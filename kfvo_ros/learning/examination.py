@@ -1,0 +1,63 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""How policies, learned or not, do on drives that nobody learned from, each by itself."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from kfvo_ros import assembly, metrics
+from kfvo_ros.backbones.base import Backbone
+from kfvo_ros.keyframes.base import KeyframePolicy
+from kfvo_ros.keyframes.learned import Setting
+from kfvo_ros.keyframes.rail import NO_RAIL, Rail
+from kfvo_ros.learning.ablation_table import Outcome
+from kfvo_ros.learning.drives import Drive
+from kfvo_ros.learning.railed import RailAlone, Random
+from kfvo_ros.learning.validation import LEAST_PERCENT, Validation
+from kfvo_ros.options import OdometryOptions
+from kfvo_ros.trajectory import Trajectory
+
+HEURISTICS = ('every', 'optical_flow', 'survival')
+DICE = (0, 1, 2)
+"""Seeds of the random policy."""
+
+
+@dataclass(frozen=True)
+class Examination:
+    """Runs policies over ``drives``, by the names of their sequences, as an odometry would."""
+
+    drives: Mapping[str, Drive]
+    backbone: Backbone
+    options: OdometryOptions
+
+    @property
+    def setting(self) -> Setting:
+        """What a learned policy must fit."""
+        return assembly.setting_of(self.options, self.backbone)
+
+    def outcomes(self, row: str, seed: int | None, policy: KeyframePolicy) -> Iterator[Outcome]:
+        """Yield how the policy does on one drive after the other."""
+        for name, drive in self.drives.items():
+            score = Validation([drive], self.backbone, self.setting).score(policy)
+            yield Outcome(row, seed, name, score.ate_percent, score.kept)
+
+    def unlearned(self, rail: Rail | None) -> Iterator[Outcome]:
+        """Yield how the heuristics do, chance inside the rail, the rail, and no odometry."""
+        for name in HEURISTICS:
+            options = replace(self.options, keyframes=name)
+            yield from self.outcomes(name, None, assembly.make_policy(options, self.backbone))
+        for seed in DICE:
+            yield from self.outcomes(Random.name, seed, Random(rail or NO_RAIL, seed))
+        if rail is not None:
+            yield from self.outcomes(RailAlone.name, None, RailAlone(rail))
+        for trivial in (metrics.constant_position, metrics.straight_line):
+            for name, drive in self.drives.items():
+                stamps_ns = np.array([frame.stamp_ns for frame in drive.frames], dtype=np.int64)
+                error = metrics.absolute_trajectory_error(
+                    trivial(stamps_ns), Trajectory(stamps_ns, drive.T_truth_camera))
+                percent = max(100.0 * error.rmse / error.path_length, LEAST_PERCENT)
+                yield Outcome(trivial.__name__, None, name, percent, 0.0)

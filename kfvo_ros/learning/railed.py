@@ -1,0 +1,40 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Policies that learned nothing, inside the rail of those that did: what does the rail alone?"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kfvo_ros.keyframes.base import DecisionInput, KeyframePolicy
+from kfvo_ros.keyframes.rail import Rail
+
+
+class RailAlone(KeyframePolicy):
+    """Drops every frame that the rail does not keep."""
+
+    name = 'rail'
+
+    def __init__(self, rail: Rail) -> None:
+        self._rail = rail
+        self.needs_tracks = rail.needs_tracks
+
+    def decide(self, decision: DecisionInput) -> bool:
+        """Ask the rail, and drop where it does not care."""
+        return bool(self._rail.forced(decision))
+
+
+class Random(KeyframePolicy):
+    """Keeps every second frame, by chance, of those that the rail leaves open."""
+
+    name = 'random'
+
+    def __init__(self, rail: Rail, seed: int) -> None:
+        self._rail = rail
+        self.needs_tracks = rail.needs_tracks
+        self._dice = np.random.default_rng(seed)
+
+    def decide(self, decision: DecisionInput) -> bool:
+        """Ask the rail, then the dice."""
+        forced = self._rail.forced(decision)
+        return forced if forced is not None else bool(self._dice.integers(2))

@@ -1,0 +1,147 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""PPO of a keyframe policy, from its first step or from a checkpoint to its last step."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import asdict
+from typing import Any
+
+from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
+from stable_baselines3.common.utils import safe_mean
+from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
+from stable_baselines3.common.vec_env.base_vec_env import VecEnv
+
+from kfvo_ros.keyframes.learned import CLIP
+from kfvo_ros.keyframes.policy_file import PolicyFile
+from kfvo_ros.keyframes.rail import NO_RAIL
+from kfvo_ros.learning.actor_critic import PrivilegedCritic
+from kfvo_ros.learning.checkpoint import Checkpoint, statistics_of
+from kfvo_ros.learning.environment import OBSERVATION
+from kfvo_ros.learning.export import export_actor
+from kfvo_ros.learning.files import TrainingFiles
+from kfvo_ros.learning.plan import Plan
+from kfvo_ros.learning.recipe import Recipe
+from kfvo_ros.learning.validation import Score, Validation
+from kfvo_ros.learning.witness import Witness
+
+EPSILON = 1e-8
+"""Of the standardisation, on the variance."""
+
+
+class Training:
+    """Learns until the plan is fulfilled: `learn`; when that was interrupted, `save`.
+
+    The best policy by ATE is written as soon as it is known; without validation that is the
+    last one. `heuristics` were scored on the same drives; `about` goes into the policy files.
+    """
+
+    def __init__(self, plan: Plan, environment: VecEnv, files: TrainingFiles,
+                 validation: Validation | None, heuristics: dict[str, Score],
+                 about: dict[str, str], checkpoint: Checkpoint | None = None) -> None:
+        self.plan, self._files, self._validation = plan, files, validation
+        self._heuristics, self._about = heuristics, about
+        self.steps, self._best = 0, math.inf
+        if checkpoint is not None:
+            self.steps, self._best = checkpoint.steps, checkpoint.best
+        self._saved_at = self.steps
+        self.model = make_model(environment, plan.recipe, plan.seed_at(self.steps))
+        self.model.set_logger(Logger(str(files.folder),
+                                     [TensorBoardOutputFormat(str(files.folder))]))
+        if checkpoint is not None:
+            checkpoint.restore(self.model)
+        for name, score in heuristics.items():
+            self._log(name, score)
+
+    def learn(self, witness: Witness) -> None:
+        """Go through all steps that are left; raises what the witness does."""
+        self.model.learn(max(self.plan.recipe.steps - self.steps, 0), _Rounds(self, witness),
+                         reset_num_timesteps=False)
+
+    def after_update(self, steps: int, is_last: bool, witness: Witness) -> None:
+        """Take note that all `steps` were learned from; validate and save when it is time."""
+        self.steps = steps
+        if not is_last and steps - self._saved_at < self.plan.recipe.validation_every:
+            return
+        self._saved_at = steps
+        scores = None
+        if self._validation is not None:
+            policy = self.policy_file().policy(self._validation.setting)
+            score = self._validation.score(policy, witness.validating)
+            scores = self._heuristics | {'learned': score}
+            is_best = score.ate_percent < self._best
+            if is_best:
+                self._best = score.ate_percent
+                self.policy_file(scores).write(self._files.output)
+            self._log('learned', score)
+            witness.validated(steps, score, is_best)
+        self.model.logger.dump(steps)
+        self.save(scores)
+
+    def save(self, scores: dict[str, Score] | None = None) -> None:
+        """Write the policy as it is now, and a checkpoint to go on from."""
+        last = self.policy_file(scores)
+        last.write(self._files.last)
+        if self._validation is None and self.steps:
+            last.write(self._files.output)
+        Checkpoint.of(self.model, self.plan, self.steps, self._best).write(
+            self._files.checkpoint)
+
+    def policy_file(self, scores: dict[str, Score] | None = None) -> PolicyFile:
+        """Return the policy as it is now, with the scores in its validation if it had one."""
+        policy = self.model.policy
+        assert isinstance(policy, PrivilegedCritic)
+        plan = self.plan
+        return PolicyFile(
+            export_actor(policy, statistics_of(self.model)[OBSERVATION], EPSILON),
+            plan.recipe.rail or NO_RAIL, plan.setting,
+            {**self._about, 'sequences': plan.sequences, 'validation': plan.validation,
+             'seed': plan.seed, 'steps': self.steps, 'recipe': asdict(plan.recipe),
+             'scores': {name: asdict(score) for name, score in (scores or {}).items()}})
+
+    def _log(self, name: str, score: Score) -> None:
+        for what, value in asdict(score).items():
+            self.model.logger.record(f'validation_{what}/{name}', value)
+
+
+def make_model(environment: VecEnv, recipe: Recipe, seed: int) -> PPO:
+    """Return the learner of an environment, of its returns and standardised observations."""
+    ppo: dict[str, Any] = asdict(recipe.ppo)
+    normalised = VecNormalize(VecMonitor(environment), norm_reward=ppo.pop('normalise_reward'),
+                              clip_obs=CLIP, gamma=recipe.ppo.gamma, epsilon=EPSILON)
+    rollout = recipe.ppo.n_steps * environment.num_envs
+    batch_size = min(ppo.pop('batch_size') or rollout, rollout)
+    with warnings.catch_warnings():  # one batch of a rollout may be smaller
+        warnings.filterwarnings('ignore', 'You have specified a mini-batch size')
+        return PPO(PrivilegedCritic, normalised, recipe.learning_rate.at, batch_size=batch_size,
+                   **ppo, seed=seed, device='cpu')
+
+
+class _Rounds(BaseCallback):
+    """Brings what happens in PPO to the training and its witness."""
+
+    def __init__(self, training: Training, witness: Witness) -> None:
+        super().__init__()
+        self._training, self._witness = training, witness
+
+    def _on_rollout_start(self) -> None:
+        if self.model.num_timesteps > self._training.steps:
+            self._training.after_update(self.model.num_timesteps, False, self._witness)
+
+    def _on_step(self) -> bool:
+        self._witness.stepped(self.model.num_timesteps)
+        return True
+
+    def _on_rollout_end(self) -> None:
+        keyframe_rate = float(self.locals['rollout_buffer'].actions.mean())
+        self.logger.record('rollout/keyframe_rate', keyframe_rate)
+        episodes = self.model.ep_info_buffer or ()
+        self._witness.collected(float(safe_mean([each['r'] for each in episodes])),
+                                keyframe_rate)
+
+    def _on_training_end(self) -> None:
+        self._training.after_update(self.model.num_timesteps, True, self._witness)

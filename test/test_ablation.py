@@ -1,0 +1,218 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""``python -m kfvo_ros.ablation``: rows that are short trainings, tested, and gone on with."""
+
+from __future__ import annotations
+
+import csv
+import shutil
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+pytest.importorskip('stable_baselines3', reason="stable-baselines3 is not installed: pip install "
+                    "'.[train]'")
+pytest.importorskip('tensorboard', reason="tensorboard is not installed: pip install '.[train]'")
+pytest.importorskip('matplotlib', reason="matplotlib is not installed: pip install '.[demo]'")
+
+from kfvo_ros import ablation
+from kfvo_ros.config_files import find_config
+from kfvo_ros.interruption import SIGNALS
+from kfvo_ros.keyframes.policy_file import read_policy
+from kfvo_ros.learning.ablation_rows import ROWS, row_recipe
+from kfvo_ros.learning.curves import read_curve
+from kfvo_ros.learning.recipe import read_recipe
+from kfvo_ros.learning.reward import ALPHA
+
+TRAINED = ('full', 'local_signals_only')
+TESTED = ('synthetic:5:smooth', 'synthetic:6:smooth')
+UNLEARNED = ('every', 'optical_flow', 'survival', 'random', 'rail', 'constant_position',
+             'straight_line')
+
+
+@pytest.fixture(scope='module')
+def folder(tmp_path_factory) -> Path:
+    """Return a folder with a recipe of short rollouts."""
+    folder = tmp_path_factory.mktemp('ablation')
+    recipe = yaml.safe_load(find_config('train.yaml').read_text())
+    recipe |= {'environments': 2, 'variants': 1, 'validation_every': 64}
+    recipe['augmentation'] |= {'max_stride': 1, 'drop_share': 0.0}
+    recipe['ppo'] |= {'n_steps': 16, 'batch_size': 16, 'n_epochs': 1}
+    (folder / 'few.yaml').write_text(yaml.safe_dump(recipe))
+    return folder
+
+
+@pytest.fixture(scope='module', autouse=True)
+def signals_as_before() -> Iterator[None]:
+    before = {number: signal.getsignal(number) for number in SIGNALS}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+def run(folder: Path, output: Path, *more: object) -> int:
+    """Run it on 30 frames of each sequence; `more` arguments win over these."""
+    return ablation.main([str(each) for each in (
+        'synthetic:1-2:smooth', '--validation', 'synthetic:3:smooth', '--test',
+        'synthetic:5-6:smooth', '--stop', 30, '--recipe', folder / 'few.yaml', '--cache',
+        folder / 'cache', '--rows', ','.join(TRAINED), '--seeds', '0,1', '--steps', 64,
+        '--output', output, *more)])
+
+
+@pytest.fixture(scope='module')
+def done(folder) -> Path:
+    """Return the output of an ablation of two rows and two seeds."""
+    assert run(folder, folder / 'done') == 0
+    return folder / 'done'
+
+
+def refused(capsys, *arguments: object) -> str:
+    """Return the one line with which the ablation itself refuses."""
+    assert ablation.main([str(each) for each in arguments]) == 1
+    lines = [line for line in capsys.readouterr().err.splitlines()
+             if line.startswith('kfvo_ablation: error: ')]
+    assert len(lines) == 1
+    return lines[0]
+
+
+def files(output: Path) -> dict[str, int]:
+    """Return when each policy was written."""
+    return {path.name: path.stat().st_mtime_ns for path in output.glob('*.safetensors')}
+
+
+def test_every_row_seed_and_sequence_is_there(done):
+    with (done / 'ablation.csv').open() as file:
+        rows = list(csv.DictReader(file))
+    assert tuple(dict.fromkeys(row['row'] for row in rows)) == TRAINED + UNLEARNED
+    seeds = {row: ['0', '1'] for row in TRAINED} | {'random': ['0', '1', '2']}
+    for name in TRAINED + UNLEARNED:
+        assert [(row['seed'], row['sequence']) for row in rows if row['row'] == name] == [
+            (seed, text) for seed in seeds.get(name, ['']) for text in TESTED]
+    value = {(row['row'], row['sequence']): float(row['ate_percent']) for row in rows}
+    assert all(value['constant_position', text] > value['straight_line', text]
+               > value['every', text] > 0.0 for text in TESTED)
+    kept = {row['row']: float(row['kept']) for row in rows}
+    assert kept['every'] == 1.0 > kept['random'] > kept['rail'] > kept['straight_line'] == 0.0
+
+
+def test_the_table_has_all_rows_and_the_curves_are_a_picture(done):
+    lines = (done / 'ablation.md').read_text().splitlines()
+    assert [line.split('`')[1] for line in lines if line.startswith('| `')] \
+        == list(TRAINED + UNLEARNED)
+    assert sum('geometric mean over 2 sequences' in line for line in lines) == 1
+    picture = cv2.imread(str(done / 'curves.png'))
+    assert picture.shape[1] > 2 * picture.shape[0] and len(np.unique(picture)) > 50
+
+
+def test_each_row_learned_what_it_says(done):
+    told = {row: read_policy(done / f'{row}-1.safetensors') for row in TRAINED}
+    parts = {row: {name for name, _ in policy.setting.observation}
+             for row, policy in told.items()}
+    assert parts['full'] == {'descriptor', 'poses'}
+    assert parts['local_signals_only'] and not parts['local_signals_only'] & parts['full']
+    assert [policy.training['recipe']['reward'] for policy in told.values()] == ['paper', 'local']
+    assert [policy.training['seed'] for policy in told.values()] == [1, 1]
+    assert read_recipe(str(done / 'full.yaml')) == row_recipe(
+        'full', read_recipe(str(done.parent / 'few.yaml')), 64)
+    command = told['full'].training['command']
+    assert command.startswith('python -m kfvo_ros.train synthetic:1:smooth synthetic:2:smooth')
+    assert str(done / 'full.yaml') in command
+
+
+def test_curves_are_what_was_logged(done):
+    curve = read_curve('full', 'paper', done / 'full-0.training')
+    assert curve.errors[:, 0].tolist() == [32.0, 64.0]
+    assert curve.returns[-1, 0] == 64.0  # by then an episode has ended
+    assert np.isfinite(curve.returns).all() and (curve.errors > 0.0).all()
+    best = read_policy(done / 'full-0.safetensors').training['scores']
+    assert curve.errors[:, 1].min() == pytest.approx(best['learned']['ate_percent'])
+    assert curve.heuristics == {name: pytest.approx(best[name]['ate_percent'])
+                                for name in ('every', 'optical_flow', 'survival')}
+
+
+def test_what_is_complete_is_not_trained_again(folder, done, tmp_path, capsys):
+    output = tmp_path / 'again'
+    shutil.copytree(done, output)
+    (output / 'full-1.safetensors').unlink()
+    shutil.rmtree(output / 'full-1.training')
+    before = files(output)
+    assert run(folder, output, '--resume') == 0
+    assert capsys.readouterr().out.count(' is complete\n') == 3
+    after = files(output)
+    assert {name for name in after if after[name] != before.get(name)} == {'full-1.safetensors'}
+    for name in ('ablation.csv', 'ablation.md'):
+        assert (output / name).read_bytes() == (done / name).read_bytes()
+
+
+def test_a_training_that_is_not_complete_goes_on(folder, tmp_path, capsys):
+    one = ('--rows', 'without_pose', '--seeds', 0)
+    assert run(folder, tmp_path, *one, '--steps', 32) == 0
+    assert run(folder, tmp_path, *one, '--resume') == 0
+    assert 'learned, 64 steps' in capsys.readouterr().out
+    curve = read_curve('without_pose', 'paper', tmp_path / 'without_pose-0.training')
+    assert curve.errors[:, 0].tolist() == [32.0, 64.0]
+
+
+def test_of_another_training_nothing_is_resumed(folder, done, tmp_path, capsys):
+    output = tmp_path / 'other'
+    shutil.copytree(done, output)
+    recipe = (folder / 'few.yaml').read_text().replace('gamma: ', 'gamma: 0.5  # ')
+    (tmp_path / 'other.yaml').write_text(recipe)
+    assert run(folder, output, '--resume', '--recipe', tmp_path / 'other.yaml') == 1
+    first, second = [line for line in capsys.readouterr().err.splitlines() if 'error:' in line]
+    assert 'recipe.ppo.gamma was ' in first and ', now 0.5' in first
+    assert second.startswith('kfvo_ablation: error: full, seed 0: not learned to the end')
+
+
+def test_nothing_is_overwritten_unasked(folder, done, capsys):
+    before = files(done)
+    assert run(folder, done) == 1
+    assert 'full-0.safetensors is there already' in capsys.readouterr().err
+    assert files(done) == before
+
+
+@pytest.mark.parametrize(('arguments', 'words'), [
+    (['--rows', 'full,without_poses'], ['without_pose, ', "came 'without_poses'"]),
+    (['--seeds', '0,one'], ['whole numbers', "came '0,one'"]),
+    (['--recipe', 'none.yaml'], ['cannot read the recipe none.yaml']),
+    (['--test', 'nowhere'], ['nowhere', 'does not exist']),
+    (['--test', 'synthetic:9-1'], ['synthetic:A-B', 'synthetic:9-1']),
+    (['--test', 'synthetic:2'], ['synthetic:2 is learned from', '--test']),
+    (['--test', 'synthetic:3'], ['synthetic:3 is learned from', '--test'])])
+def test_bad_arguments_are_refused_in_one_line(arguments, words, capsys, tmp_path):
+    line = refused(capsys, 'synthetic:1-2', '--validation', 'synthetic:3', '--test',
+                   'synthetic:4', '--output', tmp_path, *arguments)
+    assert all(word in line for word in words), line
+
+
+@pytest.mark.parametrize('missing', ['--test', '--validation', '--output'])
+def test_what_is_missing_is_named(missing, capsys):
+    given = {'--test': 'synthetic:4', '--validation': 'synthetic:3', '--output': 'here'}
+    with pytest.raises(SystemExit) as stopped:
+        ablation.main(['synthetic:1', *(text for name, value in given.items() if name != missing
+                                        for text in (name, value))])
+    assert stopped.value.code == 2
+    assert capsys.readouterr().err.splitlines()[-1].endswith(f'required: {missing}')
+
+
+def test_rows_differ_from_full_in_one_thing():
+    recipe = read_recipe('train.yaml')
+    rows = {name: row_recipe(name, recipe, 100_000) for name in ROWS}
+    full = vars(rows['full'])
+    assert (full['reward'], full['alpha'], full['without']) == ('paper', ALPHA, ('signals',))
+    changed = {name: {key: value for key, value in vars(rows[name]).items() if value != full[key]}
+               for name in ROWS}
+    assert changed['without_pose'] == {'without': ('poses', 'signals')}
+    assert changed['without_descriptor'] == {'without': ('descriptor', 'signals')}
+    assert changed['without_alpha'] == {'alpha': 0.0}
+    assert changed['alpha_penalty'] == {'alpha': -2.5e-5}
+    assert rows['local'] == row_recipe('local', recipe, 100_000)
+    assert {key for key, value in vars(rows['local']).items() if value != vars(recipe)[key]} \
+        == {'steps', 'validation_every'}
+    assert {key for key in full if vars(rows['local_signals_only'])[key]
+            != vars(rows['local'])[key]} == {'without'}

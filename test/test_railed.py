@@ -1,0 +1,47 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Policies that learned nothing, inside a rail."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kfvo_ros.keyframes.base import DecisionInput
+from kfvo_ros.keyframes.rail import NO_RAIL, Rail
+from kfvo_ros.learning.railed import RailAlone, Random
+from kfvo_ros.tracking import Tracks
+
+COUNT = 100
+RAIL = Rail(min_survival=0.5, max_gap=40, min_flow=2.0)
+
+
+def decision(flow: float, survivors: int = COUNT, gap: int = 1) -> DecisionInput:
+    """Return a decision where `survivors` of the keyframe's tracks moved by `flow` [px]."""
+    pixels = np.random.default_rng(0).uniform(0.0, 500.0, (COUNT, 2))
+    return DecisionInput(np.zeros(1, dtype=np.float32), Tracks(np.arange(COUNT), pixels),
+                         Tracks(np.arange(survivors), pixels[:survivors] + [flow, 0.0]), gap)
+
+
+@pytest.mark.parametrize('policy', [RailAlone(RAIL), Random(RAIL, 0)])
+def test_the_rail_decides_first(policy):
+    assert policy.needs_tracks
+    for _ in range(20):
+        assert policy.decide(decision(10.0, survivors=COUNT // 4)) is True
+        assert policy.decide(decision(10.0, gap=40)) is True
+        assert policy.decide(decision(1.0)) is False
+
+
+def test_the_rail_alone_drops_all_that_is_left_open():
+    assert not any(RailAlone(RAIL).decide(decision(flow)) for flow in (3.0, 30.0, 300.0))
+    assert RailAlone(NO_RAIL).decide(decision(0.0, survivors=0, gap=1000)) is False
+
+
+def test_chance_keeps_every_second_frame_and_a_seed_repeats_it():
+    runs = []
+    for seed in (0, 0, 1):
+        policy = Random(RAIL, seed)
+        runs.append([policy.decide(decision(10.0)) for _ in range(400)])
+    assert runs[0] == runs[1] != runs[2]
+    assert all(160 < sum(run) < 240 for run in runs)
+    assert not Random(NO_RAIL, 0).needs_tracks

@@ -1,0 +1,166 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The trained and the exported policy, and trainings with what the geometric backbone lacks."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip('stable_baselines3', reason="stable-baselines3 is not installed: pip install "
+                    "'.[train]'")
+
+import torch
+from test_learned import decision
+
+from kfvo_ros import run, train
+from kfvo_ros.backbones.geometric.backbone import GeometricBackbone
+from kfvo_ros.errors import KfvoError
+from kfvo_ros.interruption import SIGNALS
+from kfvo_ros.keyframes.learned import CLIP, KEEP, Learned
+from kfvo_ros.keyframes.observation import indices_of
+from kfvo_ros.keyframes.policy_file import read_policy
+from kfvo_ros.keyframes.rail import Rail
+from kfvo_ros.learning.checkpoint import Checkpoint, read_checkpoint, statistics_of
+from kfvo_ros.learning.environment import OBSERVATION, PRIVILEGED
+from kfvo_ros.learning.export import export_actor
+from kfvo_ros.learning.plan import Choices
+from kfvo_ros.learning.recipe import read_recipe
+from kfvo_ros.learning.school import make_environment
+from kfvo_ros.learning.training import EPSILON, make_model
+from kfvo_ros.options import OdometryOptions, SequenceOptions, VggtOptions
+
+DECISION_MS = 0.1
+"""A decision takes at most so long; the paper's takes 0.74 ms."""
+
+
+@pytest.fixture(autouse=True)
+def signals_as_before() -> Iterator[None]:
+    before = {number: signal.getsignal(number) for number in SIGNALS}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.fixture(scope='module')
+def learned():
+    """Return a model that learned a little, and its plan."""
+    recipe = read_recipe('train.yaml').shortened()
+    recipe = replace(recipe, ppo=replace(recipe.ppo, n_steps=32))
+    backbone = GeometricBackbone()
+    choices = Choices(0, recipe, OdometryOptions(), SequenceOptions(stop=30), VggtOptions(), None)
+    plan = choices.plan(['synthetic:1:smooth'], [], backbone)
+    environment = make_environment(choices.lesson(plan), 2, 1, 0)
+    model = make_model(environment, plan.recipe, 0)
+    model.learn(128)
+    return model, plan
+
+
+@pytest.fixture(scope='module')
+def learner(learned):
+    return learned[0]
+
+
+def test_a_checkpoint_brings_everything_back(learned, tmp_path):
+    learner, plan = learned
+    path = tmp_path / 'checkpoint.pt'
+    Checkpoint.of(learner, plan, 128, 0.5).write(path)
+    read = read_checkpoint(path, plan)
+    fresh = make_model(learner.get_vec_normalize_env().unwrapped, plan.recipe, 1)
+    read.restore(fresh)
+    assert fresh.num_timesteps == 128 and read.best == 0.5
+    for name, seen in statistics_of(learner).items():
+        back = statistics_of(fresh)[name]
+        np.testing.assert_array_equal(back.mean, seen.mean)
+        np.testing.assert_array_equal(back.var, seen.var)
+        assert back.count == seen.count
+    stored, restored = learner.get_parameters(), fresh.get_parameters()
+    for name, tensor in stored['policy'].items():
+        assert torch.equal(tensor, restored['policy'][name])
+    for number, state in stored['policy.optimizer']['state'].items():
+        again = restored['policy.optimizer']['state'][number]
+        assert all(torch.equal(value, again[name]) for name, value in state.items())
+
+
+@pytest.mark.parametrize('change', [
+    {'parameters': {}}, {'statistics': {}},
+    {'parameters': {'policy': {}, 'policy.optimizer': {}}}, {'parameters': {'__init__': {}}}])
+def test_a_checkpoint_that_does_not_fit_is_one_clear_line(learned, change):
+    learner, plan = learned
+    bad = replace(Checkpoint.of(learner, plan, 128, 0.5), **change)
+    with pytest.raises(KfvoError, match='the checkpoint does not fit') as refusal:
+        bad.restore(make_model(learner.get_vec_normalize_env().unwrapped, plan.recipe, 1))
+    assert '\n' not in str(refusal.value)
+
+
+def test_the_exported_actor_is_the_trained_one(learner):
+    normalise = learner.get_vec_normalize_env()
+    seen = normalise.obs_rms[OBSERVATION]
+    random = np.random.default_rng(0)
+    raw = random.normal(seen.mean, 4.0 * np.sqrt(seen.var), (1000, len(seen.mean)))
+    raw = raw.astype(np.float32)
+    known = normalise.normalize_obs({OBSERVATION: raw, PRIVILEGED: np.zeros(
+        (1000, len(normalise.obs_rms[PRIVILEGED].mean)), np.float32)})
+    assert np.abs(known[OBSERVATION]).max() == CLIP
+    with torch.no_grad():
+        expected = learner.policy.get_distribution(
+            learner.policy.obs_to_tensor(known)[0]).distribution.logits.numpy()
+    logits = export_actor(learner.policy, seen, EPSILON).logits(raw).astype(np.float64)
+    found = logits - np.log(np.exp(logits).sum(axis=1, keepdims=True))
+    assert np.abs(found - expected).max() < 1e-6
+    assert expected[:, KEEP].std() > 1e-3  # it says something of what it sees
+
+
+def test_a_decision_takes_no_time(learner):
+    seen = learner.get_vec_normalize_env().obs_rms[OBSERVATION]
+    policy = Learned(export_actor(learner.policy, seen, EPSILON), Rail(),
+                     np.arange(len(seen.mean)))
+    asked, took = decision(seen.mean.astype(np.float32)), []
+    for _ in range(500):
+        start = time.perf_counter()
+        policy.decide(asked)
+        took.append(1e3 * (time.perf_counter() - start))
+    assert np.median(took) <= DECISION_MS
+
+
+def test_vggt_learns_with_the_rail_that_it_can_have(small_vggt, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    recipe = Path(train.__file__).parents[1] / 'config' / 'train_paper.yaml'
+    text = recipe.read_text().replace('n_steps: 250', 'n_steps: 4').replace(
+        'rail: null', 'rail: {min_survival: 0.5, max_gap: 5, min_flow: 2.0}').replace(
+        'variants: 4', 'variants: 1').replace('steps: 5000000', 'steps: 16')
+    Path('own.yaml').write_text(text)
+    vggt = ['--backbone', 'vggt', '--weights', str(small_vggt), '--image-width', '70',
+            '--stop', '24']
+    assert train.main([
+        'synthetic:1-2:smooth', '--validation', 'synthetic:3:smooth', '--recipe', 'own.yaml',
+        '--environments', '2', *vggt, '--output', 'policy.safetensors']) == 0
+    assert 'learned, 16 steps' in capsys.readouterr().out
+    policy = read_policy(Path('policy.safetensors'))
+    assert policy.rail == Rail(0.0, 5, 0.0) and not policy.rail.needs_tracks
+    assert (policy.setting.backbone, policy.setting.scale_rule) == ('vggt', 'none')
+    assert [name for name, _ in policy.setting.observation] == ['descriptor', 'poses']
+    assert run.main(['synthetic:5', '--keyframes', 'learned', '--policy', 'policy.safetensors',
+                     '--scale', 'none', '--output', 'out', *vggt]) == 0
+
+
+def test_parts_that_are_left_out_are_neither_trained_nor_asked(tmp_path, monkeypatch):
+    backbone = GeometricBackbone()
+    recipe = replace(read_recipe('train.yaml'), without=('descriptor', 'gap'))
+    choices = Choices(0, recipe, OdometryOptions(), SequenceOptions(), VggtOptions(), None)
+    plan = choices.plan(['synthetic:1-4:smooth'], [], backbone)
+    assert [name for name, _ in plan.setting.observation][:3] == ['poses', 'track_survival',
+                                                                  'flow']
+    assert choices.lesson(plan).seen == plan.setting.observation
+    everything = choices.plan(['synthetic:1-40:smooth'], [], backbone)
+    assert (len(everything.sequences), everything.validation[0]) == (36, 'synthetic:37:smooth')
+    assert plan.validation == () and len(plan.sequences) == 4
+    whole = replace(recipe, without=())
+    present = replace(choices, recipe=whole).plan(['synthetic:1'], [], backbone).setting
+    assert len(indices_of(plan.setting.observation, present.observation)) == 49 + 7
