@@ -39,7 +39,7 @@ def read_changed(folder: Path, *keys: str, value: object = None, drop: bool = Fa
 def test_the_default_recipe():
     recipe = read_recipe('train.yaml')
     assert recipe.reward == 'local' and isinstance(recipe.rail, Rail)
-    assert recipe.steps == 300_000 and recipe.scale is None and recipe.without == ()
+    assert recipe.scale is None and recipe.without == ('descriptor', 'poses')
     assert recipe.ppo.n_steps * recipe.environments % recipe.ppo.batch_size == 0
 
 

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import signal
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -17,13 +16,12 @@ pytest.importorskip('stable_baselines3', reason="stable-baselines3 is not instal
                     "'.[train]'")
 
 import torch
-from test_learned import decision
 
 from kfvo_ros import run, train
 from kfvo_ros.backbones.geometric.backbone import GeometricBackbone
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.interruption import SIGNALS
-from kfvo_ros.keyframes.learned import CLIP, KEEP, Learned
+from kfvo_ros.keyframes.learned import CLIP, KEEP
 from kfvo_ros.keyframes.observation import indices_of
 from kfvo_ros.keyframes.policy_file import read_policy
 from kfvo_ros.keyframes.rail import Rail
@@ -35,9 +33,6 @@ from kfvo_ros.learning.recipe import read_recipe
 from kfvo_ros.learning.school import make_environment
 from kfvo_ros.learning.training import EPSILON, make_model
 from kfvo_ros.options import OdometryOptions, SequenceOptions, VggtOptions
-
-DECISION_MS = 0.1
-"""A decision takes at most so long; the paper's takes 0.74 ms."""
 
 
 @pytest.fixture(autouse=True)
@@ -115,18 +110,6 @@ def test_the_exported_actor_is_the_trained_one(learner):
     found = logits - np.log(np.exp(logits).sum(axis=1, keepdims=True))
     assert np.abs(found - expected).max() < 1e-6
     assert expected[:, KEEP].std() > 1e-3  # it says something of what it sees
-
-
-def test_a_decision_takes_no_time(learner):
-    seen = learner.get_vec_normalize_env().obs_rms[OBSERVATION]
-    policy = Learned(export_actor(learner.policy, seen, EPSILON), Rail(),
-                     np.arange(len(seen.mean)))
-    asked, took = decision(seen.mean.astype(np.float32)), []
-    for _ in range(500):
-        start = time.perf_counter()
-        policy.decide(asked)
-        took.append(1e3 * (time.perf_counter() - start))
-    assert np.median(took) <= DECISION_MS
 
 
 def test_vggt_learns_with_the_rail_that_it_can_have(small_vggt, tmp_path, monkeypatch, capsys):

@@ -22,7 +22,7 @@ ROWS: dict[str, dict[str, Any]] = {
     'without_descriptor': _PAPER | {'without': ('descriptor', 'signals')},
     'without_alpha': _PAPER | {'alpha': 0.0},
     'alpha_penalty': _PAPER | {'alpha': -ALPHA},
-    'local': {'reward': 'local'},
+    'local': {'reward': 'local', 'without': ()},
     'local_signals_only': {'reward': 'local', 'without': ('descriptor', 'poses')},
 }
 """Rows against `FULL`, which is reward and observation of the paper: the mean descriptor and the
