@@ -213,6 +213,6 @@ def test_rows_differ_from_full_in_one_thing():
     assert changed['alpha_penalty'] == {'alpha': -2.5e-5}
     assert rows['local'] == row_recipe('local', recipe, 100_000)
     assert {key for key, value in vars(rows['local']).items() if value != vars(recipe)[key]} \
-        == {'steps', 'validation_every'}
+        == {'steps', 'validation_every', 'without'}
     assert {key for key in full if vars(rows['local_signals_only'])[key]
             != vars(rows['local'])[key]} == {'without'}

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -19,8 +20,19 @@ SAME = Augmentation(0.0, 0.0, 0.0, drop_share=0.0, max_stride=1, reversal=False,
 COLOURS = np.random.default_rng(0).integers(0, 256, (12, 10, 3), dtype=np.uint8)
 
 
+@cache
+def rendered() -> tuple[Frame, ...]:
+    return tuple(SyntheticSequence(3, 'smooth', FRAMES, 160, 120))
+
+
 def sequence() -> Sequence:
-    return SyntheticSequence(3, 'smooth', FRAMES, 160, 120)
+    class Rendered(SyntheticSequence):
+        """Renders no frame twice."""
+
+        def __iter__(self):
+            return iter(rendered())
+
+    return Rendered(3, 'smooth', FRAMES, 160, 120)
 
 
 def variants(augmentation: Augmentation, count: int = 20) -> list[Variant]:

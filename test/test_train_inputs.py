@@ -78,7 +78,7 @@ def test_bad_arguments_are_refused_in_one_line(arguments, words, capsys):
 
 def test_an_unknown_part_is_refused(capsys, tmp_path):
     text = Path(train.__file__).parents[1].joinpath('config', 'train.yaml').read_text()
-    (tmp_path / 'own.yaml').write_text(text.replace('without: []', 'without: [pose]'))
+    (tmp_path / 'own.yaml').write_text(text.replace('without: [', 'without: [pose, '))
     line = refused(capsys, '--recipe', 'own.yaml')
     assert 'without: expected names out of descriptor, poses, signals, ' in line
     assert line.endswith('came pose')

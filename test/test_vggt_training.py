@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from sequence_writers import make_image, make_poses, write_tartanair
 from vggt_models import WIDTH, small_model
 
 pytest.importorskip('stable_baselines3', reason="stable-baselines3 is not installed: pip install "
@@ -33,14 +34,17 @@ class SmallLesson(Lesson):
         return VggtBackbone(small_model(), WIDTH)
 
 
-def test_twenty_sequences_take_one_encode_and_one_estimate_per_step():
+def test_twenty_sequences_take_one_encode_and_one_estimate_per_step(tmp_path):
+    sequences = [write_tartanair(tmp_path / str(number),
+                           [make_image(FRAMES * number + frame) for frame in range(FRAMES)],
+                           make_poses(FRAMES, number))[0] for number in range(ENVIRONMENTS)]
     calls: Counter[str] = Counter()
 
     def counted(name):
         return lambda module, inputs, output: calls.update([name])
 
     lesson = SmallLesson(
-        tuple(f'synthetic:{seed}:smooth' for seed in range(ENVIRONMENTS)),
+        tuple(map(str, sequences)),
         SequenceOptions(stop=FRAMES), OdometryOptions(backbone='vggt', scale_rule='none'),
         augmentation=Augmentation(drop_share=0.0, max_stride=1, frames=FRAMES),
         variants=1, reward='paper', rail=NO_RAIL)

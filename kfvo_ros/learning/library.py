@@ -22,8 +22,8 @@ from kfvo_ros.sequences.base import Sequence
 
 LEAST_FRAMES = 20
 """A shorter drive is over before much was decided."""
-MOST_HELD = 300
-"""So many drives stay in memory; of 200 frames with 150 tracks each takes 2 MB."""
+MOST_HELD = 128
+"""So many drives stay in memory: of 200 frames with 400 tracks, one takes 3 MB."""
 
 
 @dataclass

@@ -25,6 +25,7 @@ from kfvo_ros.learning.local_reward import LocalReward
 from kfvo_ros.learning.reward import PaperReward, Reward
 from kfvo_ros.learning.workers import Workers
 from kfvo_ros.options import OdometryOptions, SequenceOptions, VggtOptions
+from kfvo_ros.tracking import FEATURES
 
 LEAST_LEFT = 150
 """An episode begins anywhere but in so many last frames of a drive."""
@@ -37,8 +38,8 @@ Pupil = tuple[tuple[str, ...], np.random.SeedSequence]
 class Lesson:
     """What is learned from, and how: all that a process needs to make episodes.
 
-    ``tracks`` per frame are fewer than in use, for speed. A sequence has so many ``variants``,
-    tracked once and kept in the folder ``cache``. ``seen`` are the parts of the observation
+    ``tracks`` are followed per frame. A sequence has so many ``variants``, tracked once and kept
+    in the folder ``cache``. ``seen`` are the parts of the observation
     that are told, None for all. ``reward`` is ``paper`` or ``local``, over ``span`` frames, and
     ``alpha`` what a keyframe is worth in it.
     """
@@ -48,10 +49,10 @@ class Lesson:
     odometry: OdometryOptions = OdometryOptions()
     vggt: VggtOptions = VggtOptions()
     augmentation: Augmentation = Augmentation()
-    variants: int = 4
-    tracks: int = 150
+    variants: int = 2
+    tracks: int = FEATURES
     reward: str = 'local'
-    span: int = 100
+    span: int = 1000
     alpha: float = 0.0
     rail: Rail = Rail()
     seen: Layout | None = None
