@@ -40,7 +40,7 @@ def folder(tmp_path_factory) -> Path:
     """Return a folder with a recipe of short rollouts."""
     folder = tmp_path_factory.mktemp('ablation')
     recipe = yaml.safe_load(find_config('train.yaml').read_text())
-    recipe |= {'environments': 2, 'variants': 1, 'validation_every': 64}
+    recipe |= {'environments': 2, 'variants': 1, 'validation_every': 64, 'teacher': None}
     recipe['augmentation'] |= {'max_stride': 1, 'drop_share': 0.0}
     recipe['ppo'] |= {'n_steps': 16, 'batch_size': 16, 'n_epochs': 1}
     (folder / 'few.yaml').write_text(yaml.safe_dump(recipe))
@@ -216,3 +216,5 @@ def test_rows_differ_from_full_in_one_thing():
         == {'steps', 'validation_every', 'without'}
     assert {key for key in full if vars(rows['local_signals_only'])[key]
             != vars(rows['local'])[key]} == {'without'}
+    assert {key for key in full if vars(rows['local_untaught'])[key]
+            != vars(rows['local_signals_only'])[key]} == {'teacher'}

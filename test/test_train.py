@@ -36,7 +36,7 @@ def folder(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp('training')
     recipe = yaml.safe_load(find_config('train.yaml').read_text())
     recipe |= {'steps': 64, 'environments': 2, 'validation_every': 32, 'variants': 1,
-               'reward': 'paper'}
+               'reward': 'paper', 'teacher': None}
     recipe['augmentation'] |= {'max_stride': 1, 'drop_share': 0.0, 'frames': 25}
     recipe['ppo'] |= {'n_steps': 16, 'batch_size': 16, 'n_epochs': 2}
     (folder / 'few.yaml').write_text(yaml.safe_dump(recipe))

@@ -15,7 +15,8 @@ FULL = 'full'
 VALIDATIONS = 10
 """A learning curve has so many points or more."""
 
-_PAPER: dict[str, Any] = {'reward': 'paper', 'alpha': ALPHA, 'without': ('signals',)}
+_PAPER: dict[str, Any] = {'reward': 'paper', 'alpha': ALPHA, 'without': ('signals',),
+                          'teacher': None}
 ROWS: dict[str, dict[str, Any]] = {
     FULL: _PAPER,
     'without_pose': _PAPER | {'without': ('poses', 'signals')},
@@ -24,10 +25,11 @@ ROWS: dict[str, dict[str, Any]] = {
     'alpha_penalty': _PAPER | {'alpha': -ALPHA},
     'local': {'reward': 'local', 'without': ()},
     'local_signals_only': {'reward': 'local', 'without': ('descriptor', 'poses')},
+    'local_untaught': {'reward': 'local', 'without': ('descriptor', 'poses'), 'teacher': None},
 }
 """Rows against `FULL`, which is reward and observation of the paper: the mean descriptor and the
-relative poses, not the backbone's signals; and our own reward, on all that the recipe lets it
-see, and on the signals alone."""
+relative poses, not the backbone's signals; and our own reward on all that can be seen, on the
+signals alone, and from nothing instead of from a teacher."""
 
 
 def row_names(text: str) -> tuple[str, ...]:

@@ -10,8 +10,10 @@ from pathlib import Path
 
 from kfvo_ros import assembly
 from kfvo_ros.backbones.base import Backbone
+from kfvo_ros.errors import KfvoError
 from kfvo_ros.keyframes.learned import Setting
 from kfvo_ros.keyframes.rail import NO_RAIL
+from kfvo_ros.learning.imitation import SURVIVAL
 from kfvo_ros.learning.library import Library
 from kfvo_ros.learning.recipe import Recipe, unseen
 from kfvo_ros.learning.school import Lesson
@@ -74,6 +76,9 @@ class Choices:
         present = assembly.setting_of(self.odometry, backbone)
         left_out = unseen(recipe.without, present.observation)
         seen = tuple(part for part in present.observation if part[0] not in left_out)
+        if recipe.teacher is not None and SURVIVAL not in dict(seen):
+            raise KfvoError(f'teacher: expected null where {SURVIVAL} is not observed, came '
+                            f'{recipe.teacher:g}')
         return Plan(learned, held_out, self.seed, replace(present, observation=seen),
                     recipe)
 

@@ -53,8 +53,9 @@ class LearningRate:
 class Recipe:
     """A training, after so many ``steps``: decisions in all environments together.
 
-    ``span`` is the local reward's, ``scale`` None the backbone's own rule, ``rail`` None is no
-    rail; ``without`` names parts of the observation that the policy does not see (`unseen`).
+    ``span`` is the local reward's, ``scale`` None the backbone's own rule, ``teacher`` the share
+    of a `survival` that is imitated first, None for nobody's; ``rail`` None is no rail;
+    ``without`` names parts of the observation that the policy does not see (`unseen`).
     """
 
     steps: int = key(least=1)
@@ -64,6 +65,7 @@ class Recipe:
     span: int = key(least=40, most=1000)
     alpha: float = key(least=-1.0, most=1.0)
     scale: str | None = key(choices=SCALE_RULES)
+    teacher: float | None = key(least=0.0, most=1.0)
     rail: Rail | None = key(within={'min_survival': (0.0, 1.0), 'max_gap': (1, None),
                                     'min_flow': (0.0, 1e3)})
     without: tuple[str, ...] = key()

@@ -39,9 +39,9 @@ class Lesson:
     """What is learned from, and how: all that a process needs to make episodes.
 
     ``tracks`` are followed per frame. A sequence has so many ``variants``, tracked once and kept
-    in the folder ``cache``. ``seen`` are the parts of the observation
-    that are told, None for all. ``reward`` is ``paper`` or ``local``, over ``span`` frames, and
-    ``alpha`` what a keyframe is worth in it.
+    in the folder ``cache``. ``seen`` are the parts of the observation that are told, None for
+    all. ``reward`` is ``paper`` or ``local``, over ``span`` frames, and ``alpha`` what a keyframe
+    is worth in it.
     """
 
     sequences: tuple[str, ...]

@@ -24,6 +24,7 @@ from kfvo_ros.learning.checkpoint import Checkpoint, statistics_of
 from kfvo_ros.learning.environment import OBSERVATION
 from kfvo_ros.learning.export import export_actor
 from kfvo_ros.learning.files import TrainingFiles
+from kfvo_ros.learning.imitation import imitate
 from kfvo_ros.learning.plan import Plan
 from kfvo_ros.learning.recipe import Recipe
 from kfvo_ros.learning.validation import Score, Validation
@@ -59,6 +60,10 @@ class Training:
 
     def learn(self, witness: Witness) -> None:
         """Go through all steps that are left; raises what the witness does."""
+        teacher = self.plan.recipe.teacher
+        if teacher is not None and self.steps == 0:
+            imitate(self.model, self.plan.setting.observation, teacher,
+                    lambda: witness.stepped(0))
         self.model.learn(max(self.plan.recipe.steps - self.steps, 0), _Rounds(self, witness),
                          reset_num_timesteps=False)
 

@@ -1,0 +1,81 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""A start for PPO: the decisions of `survival`, and what they are worth.
+
+From nothing a policy keeps every second frame by chance. That is far from any good policy, and
+what a single decision changes there is lost in the noise of all the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import VecNormalize
+from torch import Tensor
+from torch.nn.functional import mse_loss
+
+from kfvo_ros.keyframes.observation import Layout
+from kfvo_ros.learning.actor_critic import PrivilegedCritic
+from kfvo_ros.learning.environment import OBSERVATION, Observations
+
+SURVIVAL = 'track_survival'
+"""The part of the observation that the teacher looks at."""
+STEPS = 256
+PASSES, BATCH, LEARNING_RATE = 24, 256, 1e-3
+CERTAINTY = 0.9
+"""So sure of the teacher's decisions the pupil becomes: some of them it still tries otherwise."""
+
+
+def imitate(model: PPO, layout: Layout, share: float,
+            before_each: Callable[[], None] = lambda: None) -> None:
+    """Teach the actor to keep where less than a share of the tracks is left, the critic its worth.
+
+    `layout` is that of the model's observation; the caller has a say `before_each` of STEPS
+    decisions in every environment.
+    """
+    column = sum(size for _, size in layout[:[name for name, _ in layout].index(SURVIVAL)])
+    environment, policy = model.get_vec_normalize_env(), model.policy
+    assert isinstance(environment, VecNormalize) and isinstance(policy, PrivilegedCritic)
+    seen, kept, returns = _watch(environment, column, share, model.gamma, before_each)
+    optimiser = torch.optim.Adam(policy.parameters(), LEARNING_RATE)
+    dice = torch.Generator().manual_seed(model.seed or 0)
+    for _ in range(PASSES):
+        for rows in torch.randperm(len(kept), generator=dice).split(BATCH):
+            batch = {name: values[rows] for name, values in seen.items()}
+            values, right, _ = policy.evaluate_actions(batch, kept[rows])
+            wrong = torch.log1p(-right.exp().clamp(max=1.0 - 1e-6))
+            loss = (0.5 * mse_loss(values.flatten(), returns[rows])
+                    - (CERTAINTY * right + (1.0 - CERTAINTY) * wrong).mean())
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step()
+
+
+def _watch(environment: VecNormalize, column: int, share: float, gamma: float,
+           before_each: Callable[[], None]) -> tuple[dict[str, Tensor], Tensor, Tensor]:
+    """Return what the teacher saw, standardised, did, and earned from then on, discounted."""
+    environment.reset()
+    seen: list[Observations] = []
+    kept, rewards, dones = [], [], []
+    for _ in range(STEPS):
+        before_each()
+        told = environment.get_original_obs()
+        assert isinstance(told, dict)
+        seen.append({name: values.copy() for name, values in told.items()})
+        kept.append((told[OBSERVATION][:, column] < share).astype(np.int64))
+        _, _, done, _ = environment.step(kept[-1])
+        rewards.append(environment.get_original_reward())
+        dones.append(done)
+    returns, later = [], np.zeros(environment.num_envs)
+    for reward, done in zip(reversed(rewards), reversed(dones)):
+        later = environment.normalize_reward(reward) + gamma * later * ~done
+        returns.append(later)
+    standardised = environment.normalize_obs(
+        {name: np.concatenate([each[name] for each in seen]) for name in seen[0]})
+    assert isinstance(standardised, dict)
+    return ({name: torch.as_tensor(values) for name, values in standardised.items()},
+            torch.as_tensor(np.concatenate(kept)),
+            torch.as_tensor(np.concatenate(returns[::-1]), dtype=torch.float32))
