@@ -125,7 +125,8 @@ def test_parts_of_the_observation_can_be_hidden(cache):
 @pytest.mark.parametrize('workers', [1, 2])
 @pytest.mark.parametrize('changes, expected', [
     ({'sequences': ('synthetic:4', '/nowhere')}, 'nowhere'),
-    ({'reading': SequenceOptions(stop=10)}, 'expected at least 20 frames')])
+    ({'reading': SequenceOptions(stop=10)}, 'expected at least 20 frames'),
+    ({'cache': Path('/dev/null/cache')}, 'cannot keep tracks in /dev/null/cache')])
 def test_what_cannot_be_learned_from_is_said_in_one_line(tmp_path, workers, changes, expected):
     wrong = Lesson(**{'sequences': SEQUENCES, 'reading': READING, 'cache': tmp_path} | changes)
     with pytest.raises(KfvoError, match=expected) as error:

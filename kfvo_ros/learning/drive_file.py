@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import asdict
 from pathlib import Path
 
@@ -13,9 +12,11 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
+from kfvo_ros.atomic import replaced
 from kfvo_ros.backbones.base import Encoded
 from kfvo_ros.backbones.geometric.observations import View
 from kfvo_ros.camera import Camera
+from kfvo_ros.errors import KfvoError, reason_of
 from kfvo_ros.learning.drives import NO_IMAGE, Drive
 from kfvo_ros.sequences.base import Frame
 from kfvo_ros.tracking import Tracks
@@ -24,7 +25,7 @@ KEY = 'kfvo_drive'
 
 
 def write_drive(path: Path, drive: Drive) -> None:
-    """Write a drive; whoever reads meanwhile sees all of it or nothing."""
+    """Write a drive; whoever reads meanwhile sees all of it or nothing. Raises KfvoError."""
     encoded = [each for each in drive.encoded if each is not None]
     tracks = [each.tracks or Tracks() for each in encoded]
     arrays = {
@@ -39,11 +40,13 @@ def write_drive(path: Path, drive: Drive) -> None:
                                   for each, all_of_it in zip(encoded, tracks, strict=True)])}
     camera = drive.frames[0].camera
     head = {'name': drive.name, 'camera': None if camera is None else asdict(camera)}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_suffix(f'.{os.getpid()}.part')
-    save_file({name: np.ascontiguousarray(array) for name, array in arrays.items()}, draft,
-              {KEY: json.dumps(head)})
-    draft.replace(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with replaced(path) as draft:
+            save_file({name: np.ascontiguousarray(array) for name, array in arrays.items()},
+                      draft, {KEY: json.dumps(head)})
+    except (OSError, SafetensorError) as error:
+        raise KfvoError(f'cannot keep tracks in {path.parent}: {reason_of(error)}') from error
 
 
 def read_drive(path: Path) -> Drive | None:

@@ -19,6 +19,8 @@ from kfvo_ros.learning.environment import Episodes, Observations
 from kfvo_ros.threads import single_threaded
 
 STEP, RESET, CLOSE = 'step', 'reset', 'close'
+PATIENCE_S = 2.0
+"""A process that is at a long sequence is not waited for: it has nothing that would be lost."""
 
 
 class Workers(Episodes):
@@ -68,7 +70,8 @@ class Workers(Episodes):
         for pipe, process in zip(self._pipes, self._processes):
             with contextlib.suppress(OSError):  # it may have ended already
                 pipe.send((CLOSE, None))
-            process.join()
+            process.join(PATIENCE_S)
+            process.terminate()
             pipe.close()
 
     def _answers(self) -> list[Any]:
