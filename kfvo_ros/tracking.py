@@ -17,6 +17,7 @@ from kfvo_ros import motion_field, optical_flow
 from kfvo_ros.camera import Camera
 from kfvo_ros.corners import find_corners
 from kfvo_ros.motion_field import MotionField
+from kfvo_ros.track_ids import shared
 
 FEATURES = 400
 CLAHE_CLIP, CLAHE_TILES = 3.0, (8, 8)
@@ -54,7 +55,7 @@ class Tracks:
 
 def common(a: Tracks, b: Tracks) -> tuple[np.ndarray, np.ndarray]:
     """Return the pixels (M, 2) in a and in b of the tracks that both see."""
-    _, in_a, in_b = np.intersect1d(a.ids, b.ids, assume_unique=True, return_indices=True)
+    in_a, in_b = shared(a.ids, b.ids)
     return a.pixels[in_a], b.pixels[in_b]
 
 
