@@ -104,8 +104,8 @@ def _examination(recipe: Recipe, test: Sequence[str], options: AblationOptions) 
     backbone = assembly.make_backbone(odometry)
     chosen = Choices(odometry.seed, recipe, odometry, SequenceOptions(stop=options.stop),
                      VggtOptions(), Path(options.cache or '').expanduser())
-    library = chosen.library(backbone)
-    return Examination({text: library.whole(text)
+    archive = chosen.archive(backbone)
+    return Examination({text: archive.whole(text)
                         for text in tqdm(test, unit='sequence', desc='test')},
                        backbone, odometry)
 

@@ -17,6 +17,7 @@ from kfvo_ros import __version__
 from kfvo_ros.commands import make_parser, run_command
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.interruption import Interrupted, signals_collected
+from kfvo_ros.keyframes import HEURISTICS
 from kfvo_ros.learning.witness import Witness
 
 if TYPE_CHECKING:
@@ -35,8 +36,9 @@ EXAMPLES = """examples:
 """
 NOT_OFFERED = ('keyframes', 'policy', 'flow_threshold', 'survival_share')
 """Options of an odometry that a training answers itself."""
-HEURISTICS = ('every', 'optical_flow', 'survival')
-SMOKE, SMOKE_VALIDATION, SMOKE_FRAMES = ('synthetic:1-2:smooth',), ('synthetic:3:smooth',), 50
+SMOKE, SMOKE_VALIDATION = ('synthetic:1:smooth',), ('synthetic:3:smooth',)
+SMOKE_FRAMES = 115
+"""The local reward begins after a hundred."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -139,8 +141,8 @@ def _validation(plan: Plan, chosen: Choices, backbone: Backbone
         print('no validation: the last policy is the one that is kept; name sequences with '
               '--validation')
         return None, {}
-    library = chosen.library(backbone)
-    drives = [library.whole(text)
+    archive = chosen.archive(backbone)
+    drives = [archive.whole(text)
               for text in tqdm(plan.validation, unit='sequence', desc='validation')]
     validation = Validation(drives, backbone, assembly.setting_of(chosen.odometry, backbone))
     print(f'{f"{len(drives)} sequences":<26}{"ATE of path":>12}{"keyframes":>16}')

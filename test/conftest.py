@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from kfvo_ros.interruption import SIGNALS
 from kfvo_ros.threads import single_threaded
 
 
@@ -26,6 +27,15 @@ def interruptible() -> None:
     """Let the processes that tests interrupt be so: a shell's background jobs ignore SIGINT."""
     if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.fixture(scope='module')
+def own_signals() -> Iterator[None]:
+    """Give back the signals that commands called in this process take for themselves."""
+    handlers = {number: signal.getsignal(number) for number in SIGNALS}
+    yield
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
 
 
 @pytest.fixture(scope='session')

@@ -6,8 +6,6 @@ from __future__ import annotations
 
 import csv
 import shutil
-import signal
-from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -22,12 +20,13 @@ pytest.importorskip('matplotlib', reason="matplotlib is not installed: pip insta
 
 from kfvo_ros import ablation
 from kfvo_ros.config_files import find_config
-from kfvo_ros.interruption import SIGNALS
 from kfvo_ros.keyframes.policy_file import read_policy
 from kfvo_ros.learning.ablation_rows import ROWS, row_recipe
 from kfvo_ros.learning.curves import read_curve
 from kfvo_ros.learning.recipe import read_recipe
 from kfvo_ros.learning.reward import ALPHA
+
+pytestmark = pytest.mark.usefixtures('own_signals')
 
 TRAINED = ('full', 'local_signals_only')
 TESTED = ('synthetic:5:smooth', 'synthetic:6:smooth')
@@ -45,14 +44,6 @@ def folder(tmp_path_factory) -> Path:
     recipe['ppo'] |= {'n_steps': 16, 'batch_size': 16, 'n_epochs': 1}
     (folder / 'few.yaml').write_text(yaml.safe_dump(recipe))
     return folder
-
-
-@pytest.fixture(scope='module', autouse=True)
-def signals_as_before() -> Iterator[None]:
-    before = {number: signal.getsignal(number) for number in SIGNALS}
-    yield
-    for number, handler in before.items():
-        signal.signal(number, handler)
 
 
 def run(folder: Path, output: Path, *more: object) -> int:

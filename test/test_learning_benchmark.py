@@ -4,9 +4,6 @@
 
 from __future__ import annotations
 
-import signal
-from collections.abc import Iterator
-
 import pytest
 import yaml
 
@@ -14,17 +11,10 @@ pytest.importorskip('stable_baselines3', reason="stable-baselines3 is not instal
                     "'.[train]'")
 
 from kfvo_ros.config_files import find_config
-from kfvo_ros.interruption import SIGNALS
 from kfvo_ros.learning import benchmark
 from kfvo_ros.learning.benchmark import Speed, table
 
-
-@pytest.fixture(autouse=True)
-def signals_as_before() -> Iterator[None]:
-    before = {number: signal.getsignal(number) for number in SIGNALS}
-    yield
-    for number, handler in before.items():
-        signal.signal(number, handler)
+pytestmark = pytest.mark.usefixtures('own_signals')
 
 
 def test_rows_are_rates_and_nothing_is_tracked_while_measuring(tmp_path, capsys):

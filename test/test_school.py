@@ -14,11 +14,11 @@ pytest.importorskip('stable_baselines3', reason="stable-baselines3 is not instal
 
 from kfvo_ros.backbones.geometric.backbone import GeometricBackbone
 from kfvo_ros.errors import KfvoError
+from kfvo_ros.learning.archive import Archive
 from kfvo_ros.learning.augmentation import Augmentation
 from kfvo_ros.learning.drive_file import read_drive, write_drive
 from kfvo_ros.learning.drives import record
 from kfvo_ros.learning.environment import OBSERVATION, PRIVILEGED
-from kfvo_ros.learning.library import Library
 from kfvo_ros.learning.school import Lesson, make_environment
 from kfvo_ros.options import SequenceOptions
 from kfvo_ros.sequences.synthetic import SyntheticSequence
@@ -90,13 +90,13 @@ def test_a_variant_is_tracked_once(backbone, tmp_path):
             return super().open(camera)
 
     for _ in range(2):
-        library = Library(Counting(), READING, {'seed': 0}, tmp_path)
+        archive = Archive(Counting(), READING, {'seed': 0}, tmp_path)
         for _ in range(2):
-            library.variant(SEQUENCES[0], Augmentation(), 1)
-            library.whole(SEQUENCES[0])
+            archive.variant(SEQUENCES[0], Augmentation(), 1)
+            archive.whole(SEQUENCES[0])
     assert Counting.opened == 2 and len(list(tmp_path.iterdir())) == 2
-    for other in (Library(Counting(), READING, {'seed': 1}, tmp_path),
-                  Library(Counting(), SequenceOptions(stop=25), {'seed': 0}, tmp_path)):
+    for other in (Archive(Counting(), READING, {'seed': 1}, tmp_path),
+                  Archive(Counting(), SequenceOptions(stop=25), {'seed': 0}, tmp_path)):
         other.whole(SEQUENCES[0])
     assert Counting.opened == 4
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 import json
 import shutil
 import signal
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -23,8 +22,9 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from kfvo_ros import run, train
 from kfvo_ros.config_files import find_config
-from kfvo_ros.interruption import SIGNALS
 from kfvo_ros.keyframes.policy_file import read_policy
+
+pytestmark = pytest.mark.usefixtures('own_signals')
 
 SEQUENCES = ('synthetic:1-2:smooth', '--validation', 'synthetic:3:smooth', '--stop', 25)
 POLICY = 'policy.safetensors'
@@ -41,14 +41,6 @@ def folder(tmp_path_factory) -> Path:
     recipe['ppo'] |= {'n_steps': 16, 'batch_size': 16, 'n_epochs': 2}
     (folder / 'few.yaml').write_text(yaml.safe_dump(recipe))
     return folder
-
-
-@pytest.fixture(scope='module', autouse=True)
-def signals_as_before() -> Iterator[None]:
-    before = {number: signal.getsignal(number) for number in SIGNALS}
-    yield
-    for number, handler in before.items():
-        signal.signal(number, handler)
 
 
 def arguments(folder: Path, *more: object) -> list[str]:

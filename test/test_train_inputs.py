@@ -5,8 +5,6 @@
 from __future__ import annotations
 
 import pickle
-import signal
-from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -21,7 +19,6 @@ import torch
 
 from kfvo_ros import train
 from kfvo_ros.errors import KfvoError
-from kfvo_ros.interruption import SIGNALS
 from kfvo_ros.keyframes.learned import Setting
 from kfvo_ros.learning.checkpoint import Checkpoint, read_checkpoint
 from kfvo_ros.learning.plan import Plan
@@ -31,13 +28,9 @@ SETTING = Setting('geometric', 'depth', 8, (('descriptor', 48), ('poses', 49)))
 
 
 @pytest.fixture(autouse=True)
-def elsewhere(tmp_path, monkeypatch) -> Iterator[None]:
-    """Work in an empty folder, and leave signals as they were."""
+def elsewhere(tmp_path, monkeypatch, own_signals) -> None:
+    """Work in an empty folder."""
     monkeypatch.chdir(tmp_path)
-    before = {number: signal.getsignal(number) for number in SIGNALS}
-    yield
-    for number, handler in before.items():
-        signal.signal(number, handler)
 
 
 @pytest.fixture

@@ -4,8 +4,6 @@
 
 from __future__ import annotations
 
-import signal
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,7 +18,6 @@ import torch
 from kfvo_ros import run, train
 from kfvo_ros.backbones.geometric.backbone import GeometricBackbone
 from kfvo_ros.errors import KfvoError
-from kfvo_ros.interruption import SIGNALS
 from kfvo_ros.keyframes.learned import CLIP, KEEP
 from kfvo_ros.keyframes.observation import indices_of
 from kfvo_ros.keyframes.policy_file import read_policy
@@ -34,13 +31,7 @@ from kfvo_ros.learning.school import make_environment
 from kfvo_ros.learning.training import EPSILON, make_model
 from kfvo_ros.options import OdometryOptions, SequenceOptions, VggtOptions
 
-
-@pytest.fixture(autouse=True)
-def signals_as_before() -> Iterator[None]:
-    before = {number: signal.getsignal(number) for number in SIGNALS}
-    yield
-    for number, handler in before.items():
-        signal.signal(number, handler)
+pytestmark = pytest.mark.usefixtures('own_signals')
 
 
 @pytest.fixture(scope='module')

@@ -5,8 +5,6 @@
 from __future__ import annotations
 
 import json
-import signal
-from collections.abc import Iterator
 from functools import partial
 
 import numpy as np
@@ -16,7 +14,6 @@ from vggt_models import SMALL, torch
 
 from kfvo_ros.backbones.vggt import benchmark
 from kfvo_ros.backbones.vggt.rehearsal import STEPS, Scene, random_model
-from kfvo_ros.interruption import SIGNALS
 from kfvo_ros.trajectory import Trajectory, read_tum
 
 COUNT, WIDTH, NATIVE_WIDTH, NATIVE_HEIGHT = 15, 140, 640, 480
@@ -82,15 +79,6 @@ def test_without_torch_the_line_says_what_to_install(tmp_path):
 
 
 # The benchmark: at full size it takes minutes and gigabytes, so here are its parts
-
-
-@pytest.fixture
-def own_signals() -> Iterator[None]:
-    """Give back the signals that a command takes for itself."""
-    handlers = {number: signal.getsignal(number) for number in SIGNALS}
-    yield
-    for number, handler in handlers.items():
-        signal.signal(number, handler)
 
 
 @pytest.mark.usefixtures('own_signals')

@@ -2,5 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Keyframe policies: which frames stay in the window."""
 
-POLICIES = ('every', 'optical_flow', 'survival', 'learned')
+HEURISTICS = ('every', 'optical_flow', 'survival')
+"""Names of the policies by rule."""
+POLICIES = (*HEURISTICS, 'learned')
 """Names of the policies, as options and results have them."""

@@ -133,9 +133,9 @@ def _prepare(sequences: tuple[str, ...], options: BenchmarkOptions,
     backbone = assembly.make_backbone(odometry)
     # Held out, as a training would, is none of them.
     lesson = replace(chosen.lesson(chosen.plan(sequences, (), backbone)), sequences=sequences)
-    library = lesson.library(lesson.backbone())
+    archive = lesson.archive(lesson.backbone())
     for text in tqdm(sequences, unit='sequence', desc='tracking'):
-        library.variant(text, lesson.augmentation, 0)
+        archive.variant(text, lesson.augmentation, 0)
     return lesson, recipe
 
 

@@ -15,11 +15,13 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import LogLocator
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from kfvo_ros.keyframes import HEURISTICS
+
 ERROR, RETURN = 'validation_ate_percent/', 'rollout/ep_rew_mean'
-HEURISTICS = {'every': ':', 'optical_flow': '--', 'survival': '-.'}
 COLOURS = ('#000000', '#0072b2', '#d55e00', '#009e73', '#cc79a7', '#e69f00', '#56b4e9',
            '#8c564b')
 """Okabe and Ito's, which nearly all eyes tell apart."""
+DASHES = dict(zip(HEURISTICS, (':', '--', '-.'), strict=True))
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,7 @@ def plot_curves(path: Path, curves: Sequence[Curve]) -> None:
     first, *others = figure.subplots(1, 1 + len(rewards), squeeze=False)[0]
     _draw(first, colours, [(curve.row, curve.errors) for curve in curves])
     for name, error in curves[0].heuristics.items():
-        first.axhline(error, color='grey', linestyle=HEURISTICS[name], linewidth=1.2, label=name)
+        first.axhline(error, color='grey', linestyle=DASHES[name], linewidth=1.2, label=name)
     first.set(title='validation', yscale='log', ylabel='ATE after Sim(3) [% of the path]')
     first.yaxis.set(major_locator=LogLocator(subs=(1.0, 2.0, 3.0, 5.0, 7.0)),
                     major_formatter='{x:g}', minor_formatter='')

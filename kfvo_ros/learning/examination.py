@@ -11,6 +11,7 @@ import numpy as np
 
 from kfvo_ros import assembly, metrics
 from kfvo_ros.backbones.base import Backbone
+from kfvo_ros.keyframes import HEURISTICS
 from kfvo_ros.keyframes.base import KeyframePolicy
 from kfvo_ros.keyframes.learned import Setting
 from kfvo_ros.keyframes.rail import NO_RAIL, Rail
@@ -21,7 +22,6 @@ from kfvo_ros.learning.validation import LEAST_PERCENT, Validation
 from kfvo_ros.options import OdometryOptions
 from kfvo_ros.trajectory import Trajectory
 
-HEURISTICS = ('every', 'optical_flow', 'survival')
 DICE = (0, 1, 2)
 """Seeds of the random policy."""
 

@@ -13,8 +13,8 @@ from kfvo_ros.backbones.base import Backbone
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.keyframes.learned import Setting
 from kfvo_ros.keyframes.rail import NO_RAIL
+from kfvo_ros.learning.archive import Archive
 from kfvo_ros.learning.imitation import SURVIVAL
-from kfvo_ros.learning.library import Library
 from kfvo_ros.learning.recipe import Recipe, unseen
 from kfvo_ros.learning.school import Lesson
 from kfvo_ros.options import OdometryOptions, SequenceOptions, VggtOptions
@@ -90,8 +90,8 @@ class Choices:
                       recipe.span, recipe.alpha, recipe.rail or NO_RAIL,
                       plan.setting.observation, self.cache)
 
-    def library(self, backbone: Backbone) -> Library:
+    def archive(self, backbone: Backbone) -> Archive:
         """Return where the drives of a validation come from, with the tracks of an odometry."""
-        return Library(backbone, self.reading,
+        return Archive(backbone, self.reading,
                        {'seed': self.odometry.seed, 'tracks': FEATURES}, self.cache,
                        live=not backbone.offers_tracks)

@@ -81,8 +81,7 @@ class Recipe:
         """Return the recipe of a test that shows whether everything runs."""
         return replace(self, steps=400, environments=2, validation_every=200,
                        ppo=replace(self.ppo, n_steps=100, n_epochs=2),
-                       variants=1,
-                       augmentation=replace(self.augmentation, max_stride=1, frames=45))
+                       variants=1, augmentation=replace(self.augmentation, max_stride=1))
 
 
 def read_recipe(name: str) -> Recipe:

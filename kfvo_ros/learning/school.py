@@ -16,11 +16,11 @@ from kfvo_ros import assembly
 from kfvo_ros.backbones.base import Backbone
 from kfvo_ros.keyframes.observation import Layout, indices_of
 from kfvo_ros.keyframes.rail import Rail
+from kfvo_ros.learning.archive import Archive
 from kfvo_ros.learning.augmentation import Augmentation
 from kfvo_ros.learning.drives import true_trajectory
 from kfvo_ros.learning.environment import KeyframeEnvironment
 from kfvo_ros.learning.episode import Episode
-from kfvo_ros.learning.library import Library
 from kfvo_ros.learning.local_reward import LocalReward
 from kfvo_ros.learning.reward import PaperReward, Reward
 from kfvo_ros.learning.workers import Workers
@@ -65,9 +65,9 @@ class Lesson:
             return GeometricBackbone(self.odometry.seed, self.tracks)
         return assembly.make_backbone(self.odometry, self.vggt)
 
-    def library(self, backbone: Backbone) -> Library:
+    def archive(self, backbone: Backbone) -> Archive:
         """Return where the drives come from: tracked once, or held as images to be encoded."""
-        return Library(backbone, self.reading,
+        return Archive(backbone, self.reading,
                        {'seed': self.odometry.seed, 'tracks': self.tracks}, self.cache,
                        live=not backbone.offers_tracks)
 
@@ -85,7 +85,7 @@ class School:
         self._lesson = lesson
         self._backbone = lesson.backbone()
         self._present = assembly.setting_of(lesson.odometry, self._backbone)
-        self._library = lesson.library(self._backbone)
+        self._archive = lesson.archive(self._backbone)
 
     def environment(self, pupils: Sequence[Pupil]) -> KeyframeEnvironment:
         """Return an environment that steps one episode of each at a time."""
@@ -99,7 +99,7 @@ class School:
         lesson, dice = self._lesson, np.random.default_rng(seed)
         while True:
             for text in dice.permutation(sequences):
-                drive = self._library.variant(str(text), lesson.augmentation,
+                drive = self._archive.variant(str(text), lesson.augmentation,
                                               int(dice.integers(lesson.variants)))
                 start = int(dice.integers(max(1, len(drive) - LEAST_LEFT)))
                 yield Episode(drive.since(start), self._backbone, self._present.scale_rule,

@@ -27,7 +27,7 @@ MOST_HELD = 128
 
 
 @dataclass
-class Library:
+class Archive:
     """Gives drives; `about` names whatever else they depend on: the backbone and its choices.
 
     Without a `folder` nothing is kept on disk. With `live` frames keep their images, to be
