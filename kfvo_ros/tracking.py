@@ -13,19 +13,18 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from kfvo_ros import motion_field, optical_flow
+from kfvo_ros import motion_field
 from kfvo_ros.camera import Camera
 from kfvo_ros.corners import find_corners
 from kfvo_ros.motion_field import MotionField
 from kfvo_ros.track_ids import shared
+from kfvo_ros.track_search import find_again
 
 FEATURES = 400
 CLAHE_CLIP, CLAHE_TILES = 3.0, (8, 8)
 RIM = 4
 """Tracks end this close to the rim [px]."""
 
-PREDICTED_SHARE = 0.4
-"""When fewer tracks are found from a prediction, it was wrong, and they are searched around."""
 MAX_EPIPOLAR_ERROR = 1.5
 RANSAC_CONFIDENCE, RANSAC_ITERATIONS = 0.99, 300
 MIN_RANSAC_TRACKS = 16
@@ -101,24 +100,11 @@ class Tracker:
             return Tracks()
         size = np.array(image.shape[::-1])
         before = self._tracks.pixels
-        after, found = self._search(last, image, field)
+        after, found = find_again(last, image, before, field)
         found &= ((after >= RIM) & (after < size - RIM)).all(axis=1)
         found[found] = self._agreeing(before[found], after[found])
         self._field = motion_field.fit(before[found], (after - before)[found], size)
         return Tracks(self._tracks.ids[found], after[found])
-
-    def _search(self, last: np.ndarray, image: np.ndarray,
-                field: MotionField | None) -> tuple[np.ndarray, np.ndarray]:
-        """Look where the motion of the last frame leads, or all around if that fails."""
-        points = self._tracks.pixels
-        after, found = points, np.zeros(len(points), dtype=bool)
-        if field is not None:
-            after, found = optical_flow.follow(last, image, points, points + field.at(points))
-        if found.mean() < PREDICTED_SHARE:
-            around, found_around = optical_flow.follow(last, image, points)
-            if found_around.sum() > found.sum():
-                return around, found_around
-        return after, found
 
     def _agreeing(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
         """Return a mask (N,) of the pairs that follow one epipolar geometry."""
