@@ -37,13 +37,24 @@ PYTHON := $(shell for python in $(CANDIDATES); do \
 	$$python -c '$(SUPPORTED)' 2>/dev/null && echo $$python && break; done)
 endif
 
-.PHONY: help demo bench-node bench-train test lint clean
+# docs/results.md: what of KFVO_DATA looks like a dataset, called as from there, and rooms.
+MARKS := mav0 rgb.txt times.txt pose_left.txt
+FOUND = $(foreach mark,$(MARKS),$(foreach depth,* */* */*/* */*/*/*,\
+	$(wildcard $(KFVO_DATA)/$(depth)/$(mark))))
+SEQUENCES ?= $(patsubst $(KFVO_DATA)/%/,%,$(sort $(dir $(FOUND)))) \
+	synthetic:0-4:smooth synthetic:0-4:fast
+POLICY ?=
+OPTIONS ?= --seeds 0,1,2
+
+.PHONY: help demo bench-node bench-train results test lint clean
 
 help:
 	@echo 'make demo    a rendered sequence through kfvo_node, over DDS, into demo/'
 	@echo 'make test    install into $(VENV) and run ruff and the tests'
 	@echo 'make bench-node   a minute of 752x480 at 20 Hz, then at twice what the node can take'
 	@echo 'make bench-train  decisions per second of the environment, and of PPO'
+	@echo 'make results  docs/results.md: all methods on KFVO_DATA and on rooms; POLICY=FILE: a'
+	@echo '              learned one too. It goes on where it was interrupted'
 	@echo 'make lint    ruff and mypy'
 	@echo 'make clean   remove the environments and all that was built'
 	@echo
@@ -59,6 +70,12 @@ bench-node: $(INSTALLED)
 
 bench-train: $(TOOLS)
 	$(VENV)/bin/python -m kfvo_ros.learning.benchmark
+
+results: $(TOOLS)
+	cd '$(or $(wildcard $(KFVO_DATA)),.)' && '$(CURDIR)/$(VENV)/bin/python' -m \
+		kfvo_ros.benchmark $(SEQUENCES) $(OPTIONS) --resume --output '$(CURDIR)/results' \
+		$(if $(POLICY),--policy '$(abspath $(POLICY))')
+	cp results/results.md results/trajectories.png results/errors.png docs/
 
 test: $(TOOLS)
 	$(VENV)/bin/ruff check .
@@ -83,5 +100,5 @@ $(TOOLS): $(INSTALLED)
 	@touch $@
 
 clean:
-	rm -rf .venv* build install log demo *.egg-info .pytest_cache .ruff_cache .mypy_cache
+	rm -rf .venv* build install log demo results *.egg-info .pytest_cache .ruff_cache .mypy_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -17,6 +17,7 @@ setup(
     maintainer='The kfvo_ros authors',
     maintainer_email='maintainers@kfvo-ros.example',
     packages=find_packages(include=[NAME, f'{NAME}.*']),
+    package_data={f'{NAME}.benchmarking': ['published.yaml']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
@@ -57,7 +58,7 @@ setup(
             'kfvo_convert = kfvo_ros.convert:main',
             'kfvo_play = kfvo_ros.play:main',
             'kfvo_train = kfvo_ros.train:main',
-            'kfvo_benchmark = kfvo_ros.commands:not_in_this_version',
+            'kfvo_benchmark = kfvo_ros.benchmark:main',
         ],
     },
 )

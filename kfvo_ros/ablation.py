@@ -19,7 +19,8 @@ from typing import TYPE_CHECKING
 from kfvo_ros import train
 from kfvo_ros.commands import make_parser, run_command
 from kfvo_ros.errors import KfvoError
-from kfvo_ros.learning.ablation_rows import ROWS, row_names, row_recipe
+from kfvo_ros.learning.ablation_rows import ROWS, row_recipe
+from kfvo_ros.lists import names_in, numbers_in
 from kfvo_ros.options import add_arguments, from_arguments, option
 from kfvo_ros.sequences.spelling import spelled_out
 
@@ -70,7 +71,8 @@ def _ablate(argv: list[str]) -> None:
     # The heavy imports come after the arguments were checked: --help answers at once.
     arguments = _parse(argv)
     options, material = from_arguments(AblationOptions, arguments), _material(arguments)
-    rows, seeds = row_names(options.rows), _seeds(options.seeds)
+    rows = names_in(options.rows, 'rows', ROWS)
+    seeds = numbers_in(options.seeds, 'seeds')
     import matplotlib  # noqa: F401  what is missing is told before hours of training
     import stable_baselines3  # noqa: F401
     import tensorboard  # noqa: F401
@@ -150,14 +152,6 @@ def _write(trials: Sequence[Trial], outcomes: Sequence[Outcome]) -> None:
     write_markdown(folder / PAGE, in_order)
     plot_curves(folder / CURVES, [read_curve(trial.row, trial.recipe.reward, trial.files.folder)
                                   for trial in trials])
-
-
-def _seeds(text: str) -> tuple[int, ...]:
-    """Return the seeds of ``a,b,...``, each once; raises KfvoError."""
-    parts = text.split(',')
-    if not all(part.isascii() and part.isdigit() for part in parts):
-        raise KfvoError(f'seeds: expected whole numbers with commas in between, came {text!r}')
-    return tuple(dict.fromkeys(map(int, parts)))
 
 
 def _material(arguments: argparse.Namespace) -> Material:

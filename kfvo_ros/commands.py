@@ -10,7 +10,6 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 from kfvo_ros import __version__
 from kfvo_ros.errors import KfvoError, reason_of
@@ -53,14 +52,6 @@ def run_command(command: str, body: Callable[[list[str]], None], argv: list[str]
     except OSError as error:
         problem = f'{error.filename or ""}: {reason_of(error)}'.lstrip(': ')
     print(f'{command}: error: {problem}', file=sys.stderr)
-    return 1
-
-
-def not_in_this_version() -> int:
-    """Say on stderr that the command called is still to come; return exit status 1."""
-    command = Path(sys.argv[0]).name
-    print(f'{command} is not part of kfvo_ros {__version__}; kfvo_run, kfvo_node, kfvo_convert, '
-          'kfvo_play and kfvo_train are', file=sys.stderr)
     return 1
 
 

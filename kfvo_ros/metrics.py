@@ -110,18 +110,40 @@ def relative_pose_error(estimate: Trajectory, truth: Trajectory, delta: float, u
     KfvoError where the ATE does, when there is no such pair, and for a truth that measured
     positions only.
     """
+    estimate, truth = match_motion(estimate, truth, with_scale)
+    first, second = _pairs(truth, delta, unit)
+    trans, rot_deg = motion_errors(estimate, truth, first, second)
+    return RelativeError(_rmse(trans), _rmse(rot_deg), estimate.stamps_ns[first], trans, rot_deg)
+
+
+def match_motion(estimate: Trajectory, truth: Trajectory, with_scale: bool = True
+                 ) -> tuple[Trajectory, Trajectory]:
+    """Return the matched poses of both, the estimate's positions in the truth's scale.
+
+    That scale is the ATE's; it stays 1 unless `with_scale`. Raises KfvoError where the ATE does,
+    and for positions without rotation.
+    """
     if not (truth.has_rotation and estimate.has_rotation):
         raise KfvoError('expected poses, found positions without rotation: these give an '
                         'absolute trajectory error only')
     scale = absolute_trajectory_error(estimate, truth, with_scale).alignment.scale
     estimate, truth = match(estimate, truth)
-    first, second = _pairs(truth, delta, unit)
-    step = geometry.relative(estimate.poses[first], estimate.poses[second])
-    step[:, :3, 3] *= scale
-    error = geometry.relative(geometry.relative(truth.poses[first], truth.poses[second]), step)
-    trans = np.linalg.norm(error[:, :3, 3], axis=1)
-    rot_deg = np.rad2deg(geometry.rotation_angle(error[:, :3, :3]))
-    return RelativeError(_rmse(trans), _rmse(rot_deg), estimate.stamps_ns[first], trans, rot_deg)
+    poses = estimate.poses.copy()
+    poses[:, :3, 3] *= scale
+    return Trajectory(estimate.stamps_ns, poses), truth
+
+
+def motion_errors(estimate: Trajectory, truth: Trajectory, first: np.ndarray,
+                  second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return by how much (M,) [m] and (M,) [deg] the motions between matched poses differ.
+
+    The m-th motion goes from pose ``first[m]`` to pose ``second[m]`` of both trajectories.
+    """
+    moved, truly_moved = (geometry.relative(each.poses[first], each.poses[second])
+                          for each in (estimate, truth))
+    error = geometry.relative(truly_moved, moved)
+    return (np.linalg.norm(error[:, :3, 3], axis=1),
+            np.rad2deg(geometry.rotation_angle(error[:, :3, :3])))
 
 
 def constant_position(stamps_ns: np.ndarray) -> Trajectory:
@@ -132,7 +154,7 @@ def constant_position(stamps_ns: np.ndarray) -> Trajectory:
 def straight_line(stamps_ns: np.ndarray) -> Trajectory:
     """Return one unit per second along x without rotation; aligned, the best straight line."""
     line = constant_position(stamps_ns)
-    line.poses[:, 0, 3] = _distance_along(line, 'seconds')
+    line.poses[:, 0, 3] = distance_along(line, 'seconds')
     return line
 
 
@@ -152,11 +174,23 @@ def max_rotation_deg(trajectory: Trajectory) -> float:
     return float(np.rad2deg(geometry.rotation_angle(steps[:, :3, :3])).max(initial=0.0))
 
 
+def distance_along(truth: Trajectory, unit: Unit) -> np.ndarray:
+    """Return how far every pose (N,) is from the first along the trajectory, in `unit`."""
+    if unit == 'frames':
+        return np.arange(len(truth), dtype=np.float64)
+    if unit == 'seconds':
+        return (truth.stamps_ns - truth.stamps_ns[:1]) / NANOSECONDS
+    if unit == 'metres':
+        steps = np.linalg.norm(np.diff(truth.positions, axis=0), axis=1)
+        return np.concatenate([[0.0], np.cumsum(steps)])
+    raise KfvoError(f"expected unit 'frames', 'seconds' or 'metres', {unit!r} came")
+
+
 def _pairs(truth: Trajectory, delta: float, unit: Unit) -> tuple[np.ndarray, np.ndarray]:
     """Return the indices (M,), (M,) of first and second pose of all pairs `delta` apart."""
     if not 0.0 < delta < np.inf or (unit == 'frames' and delta != int(delta)):
         raise KfvoError(f'expected a positive (for frames: whole) delta, {delta} came')
-    along, tolerance = _distance_along(truth, unit), PAIR_TOLERANCE * delta
+    along, tolerance = distance_along(truth, unit), PAIR_TOLERANCE * delta
     if unit == 'frames':
         tolerance = 0.0
     first = np.arange(len(truth) - 1)
@@ -171,18 +205,6 @@ def _pairs(truth: Trajectory, delta: float, unit: Unit) -> tuple[np.ndarray, np.
         raise KfvoError(f'no two of the {len(truth)} poses are {delta:g} {unit} apart, they '
                         f'span {along[-1]:g} {unit}; ask for less')
     return first[close], second[close]
-
-
-def _distance_along(truth: Trajectory, unit: Unit) -> np.ndarray:
-    """Return how far every pose (N,) is from the first along the trajectory, in `unit`."""
-    if unit == 'frames':
-        return np.arange(len(truth), dtype=np.float64)
-    if unit == 'seconds':
-        return (truth.stamps_ns - truth.stamps_ns[:1]) / NANOSECONDS
-    if unit == 'metres':
-        steps = np.linalg.norm(np.diff(truth.positions, axis=0), axis=1)
-        return np.concatenate([[0.0], np.cumsum(steps)])
-    raise KfvoError(f"expected unit 'frames', 'seconds' or 'metres', {unit!r} came")
 
 
 def _rmse(errors: np.ndarray) -> float:

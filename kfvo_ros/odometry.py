@@ -4,7 +4,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -76,7 +77,7 @@ class Update:
     window; ``final`` are the frames whose poses became final, in input order;
     ``median_depth`` of the window's points [trajectory units], None without points;
     ``durations`` [s] of the steps encode, estimate, decide; ``intrinsics`` K (3, 3) [px] where
-    the backbone estimates them.
+    the backbone estimates them; ``parts`` [s] of these steps, where it tells them.
     """
 
     stamp_ns: int
@@ -89,6 +90,7 @@ class Update:
     median_depth: float | None
     durations: dict[str, float]
     intrinsics: np.ndarray | None = None
+    parts: Mapping[str, float] = field(default_factory=dict)
 
 
 class KeyframeOdometry:
@@ -115,6 +117,7 @@ class KeyframeOdometry:
         self._status = Status.OK
         self._covariance = self._window_covariance = np.zeros((6, 6))
         self._intrinsics: np.ndarray | None = None
+        self._parts: Mapping[str, float] = {}
         self._lost_in_a_row = 0
         self._frames_seen = 0
 
@@ -164,6 +167,7 @@ class KeyframeOdometry:
             # and as doubtful.
             self._known = Knowledge(self._newest.T_world_camera, self._newest.covariance)
             self._status = Status.OK if self._newest.index == 0 else Status.LOST
+            self._parts = {}
             return True
         scale, memory_scale = 1.0, self._known.memory_scale
         if estimate.status is not Status.LOST:
@@ -172,6 +176,7 @@ class KeyframeOdometry:
         self._lost_in_a_row = self._lost_in_a_row + 1 if estimate.status is Status.LOST else 0
         T_world_anchor = self._keyframes[0].T_world_camera
         self._status, self._intrinsics = estimate.status, estimate.intrinsics
+        self._parts = estimate.durations
         self._doubt(estimate, scale)
         self._known = Knowledge(
             self._newest.T_world_camera,
@@ -204,7 +209,7 @@ class KeyframeOdometry:
             np.linalg.norm(points.positions - newest.T_world_camera[:3, 3], axis=1)))
         return Update(newest.encoded.stamp_ns, newest.T_world_camera, self._covariance,
                       self._window_covariance, self._status, keep, final, depth, durations,
-                      self._intrinsics)
+                      self._intrinsics, self._parts)
 
     def finish(self) -> tuple[Placed, ...]:
         """Return the frames whose poses were not final yet; they are now."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 import argparse
 import types
 import typing
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import MISSING, Field, dataclass, field, fields
 from typing import Any, TypeVar
 
 from kfvo_ros.keyframes import POLICIES
@@ -149,8 +149,7 @@ def add_arguments(parser: argparse.ArgumentParser, options: type[Any],
             about |= {'action': 'append', 'default': None}
         if meta['bare'] is not None:
             about |= {'nargs': '?', 'const': meta['bare']}
-        group.add_argument(f'--{(meta["flag"] or declared.name).replace("_", "-")}',
-                           dest=declared.name, **about)
+        group.add_argument(_flag(declared), dest=declared.name, **about)
 
 
 def from_arguments(options: type[Options], arguments: argparse.Namespace) -> Options:
@@ -161,10 +160,30 @@ def from_arguments(options: type[Options], arguments: argparse.Namespace) -> Opt
                       for name, value in values.items() if value is not None})
 
 
+def to_arguments(options: Any, without: tuple[str, ...] = ()) -> list[str]:
+    """Return the command line that gives these options, `without` some; defaults stay unsaid."""
+    arguments = []
+    for declared in fields(options):
+        value = getattr(options, declared.name)
+        if declared.name in without or value == declared.default:
+            continue
+        if value is True:
+            arguments.append(_flag(declared))
+        else:
+            # With '=', for a value may begin with a dash.
+            arguments += [f'{_flag(declared)}={each}'
+                          for each in (value if isinstance(value, tuple) else (value,))]
+    return arguments
+
+
 def type_of(options: type[Any], name: str) -> type[Any]:
     """Return the type of a field, that of its elements if it is a tuple, without None."""
     hint = typing.get_type_hints(options)[name]
     return next(part for part in typing.get_args(hint) or (hint,) if part is not types.NoneType)
+
+
+def _flag(declared: Field[Any]) -> str:
+    return f'--{(declared.metadata["flag"] or declared.name).replace("_", "-")}'
 
 
 def _parser_of(options: type[Any], name: str, meta: Any) -> Any:

@@ -47,6 +47,7 @@ class ResultWriter:
         self._placed_stamps: list[int] = []
         self._placed_poses: list[np.ndarray] = []
         self._durations: dict[str, list[float]] = {}
+        self._parts: dict[str, list[float]] = {}
         self._depths: list[float] = []
         self._intrinsics: list[np.ndarray] = []
         self._statuses = dict.fromkeys(Status, 0)
@@ -60,8 +61,9 @@ class ResultWriter:
             self._depths.append(update.median_depth)
         if update.intrinsics is not None:
             self._intrinsics.append(update.intrinsics)
-        for step, seconds in update.durations.items():
-            self._durations.setdefault(step, []).append(1e3 * seconds)
+        for times, told in ((self._durations, update.durations), (self._parts, update.parts)):
+            for step, seconds in told.items():
+                times.setdefault(step, []).append(1e3 * seconds)
         self.append(update.final)
 
     def append(self, final: Iterable[Placed]) -> None:
@@ -124,10 +126,11 @@ class ResultWriter:
             raise self._failure from error
 
     def _milliseconds(self) -> dict[str, dict[str, float]]:
-        """Return median and 95th percentile of each step and of their sum."""
+        """Return median and 95th percentile of each step, of their sum, and of parts of them."""
         steps = {step: np.array(values) for step, values in self._durations.items()}
         if steps:
             steps['total'] = np.sum(list(steps.values()), axis=0)
+        steps |= {part: np.array(values) for part, values in self._parts.items()}
         return {step: {'median': round(float(np.median(values)), 3),
                        'p95': round(float(np.percentile(values, 95)), 3)}
                 for step, values in steps.items()}

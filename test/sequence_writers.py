@@ -52,10 +52,11 @@ def pose_numbers(pose: np.ndarray) -> list[float]:
     return [*pose[:3, 3], *geometry.quat_xyzw_from_rotation(pose[:3, :3])]
 
 
-def write_camera_info(folder: Path, fx: float, width: int = WIDTH, height: int = HEIGHT) -> None:
+def write_camera_info(folder: Path, fx: float, width: int = WIDTH, height: int = HEIGHT,
+                      cx: float = 16, cy: float = 12) -> None:
     """Write a camera_info.yaml whose focal length tells it apart."""
     write_text(folder / 'camera_info.yaml', f'image_width: {width}', f'image_height: {height}',
-               f'camera_matrix: {{data: [{fx}, 0, 16, 0, {fx}, 12, 0, 0, 1]}}',
+               f'camera_matrix: {{data: [{fx}, 0, {cx}, 0, {fx}, {cy}, 0, 0, 1]}}',
                'distortion_model: plumb_bob', 'distortion_coefficients: {data: [0, 0, 0, 0, 0]}')
 
 

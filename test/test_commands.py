@@ -14,8 +14,8 @@ from command_lines import ENVIRONMENT, one_readable_line, run_interrupted, run_p
 
 import kfvo_ros
 
-COMMANDS = ('run', 'convert', 'play', 'node', 'demo', 'node_benchmark', 'train')
-LIGHT_COMMANDS = ('run', 'convert', 'play', 'demo', 'train')
+COMMANDS = ('run', 'convert', 'play', 'node', 'demo', 'node_benchmark', 'train', 'benchmark')
+LIGHT_COMMANDS = ('run', 'convert', 'play', 'demo', 'train', 'benchmark')
 SCRIPT = """
 import logging, os, signal, sys, time
 import numpy as np

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from policies import ALWAYS, NEVER, random_actor, write_policy
 from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
@@ -29,15 +30,6 @@ SIZE = 48 + 49 + 2
 SETTING = Setting('geometric', 'depth', 8, LAYOUT)
 
 
-def actor(size: int = SIZE, seed: int = 0) -> Actor:
-    random = np.random.default_rng(seed)
-    sizes = [size, 256, 256, 2]
-    return Actor(random.normal(size=size), random.uniform(0.5, 2.0, size),
-                 tuple(Layer(random.normal(0.0, last ** -0.5, (out, last)).astype(np.float32),
-                             random.normal(size=out).astype(np.float32))
-                       for last, out in zip(sizes, sizes[1:])))
-
-
 def decision(observation: np.ndarray, survivors: int = 80, flow: float = 10.0,
              gap: int = 1) -> DecisionInput:
     pixels = np.random.default_rng(3).uniform(50.0, 400.0, (100, 2))
@@ -47,7 +39,7 @@ def decision(observation: np.ndarray, survivors: int = 80, flow: float = 10.0,
 
 def test_the_network_is_the_one_that_torch_runs():
     torch = pytest.importorskip('torch', reason="torch is not installed: pip install torch")
-    numbers = actor()
+    numbers = random_actor(SIZE)
     steps = [torch.nn.Linear(len(layer.weight[0]), len(layer.bias)) for layer in numbers.layers]
     for step, layer in zip(steps, numbers.layers):
         step.weight.data, step.bias.data = map(torch.tensor, (layer.weight, layer.bias))
@@ -101,8 +93,8 @@ def test_no_rail_forces_nothing():
     assert not left.needs_tracks and left.forced(decision(np.zeros(SIZE), survivors=0)) is None
     assert left.forced(decision(np.zeros(SIZE), gap=40)) is True
     nothing = indices_of(LAYOUT, LAYOUT)
-    assert Learned(actor(), Rail(), nothing).needs_tracks
-    assert not Learned(actor(), left, nothing).needs_tracks
+    assert Learned(random_actor(SIZE), Rail(), nothing).needs_tracks
+    assert not Learned(random_actor(SIZE), left, nothing).needs_tracks
 
 
 @pytest.mark.parametrize('wrong', [{'min_survival': 1.1}, {'max_gap': 0}, {'min_flow': -1.0},
@@ -113,7 +105,7 @@ def test_an_impossible_rail_is_refused(wrong):
 
 
 def test_a_file_holds_all_of_a_policy(tmp_path: Path):
-    written = PolicyFile(actor(), Rail(0.4, 30, 1.5), SETTING, {'steps': 5, 'seed': 1})
+    written = PolicyFile(random_actor(SIZE), Rail(0.4, 30, 1.5), SETTING, {'steps': 5, 'seed': 1})
     written.write(tmp_path / 'policy.safetensors')
     read = read_policy(tmp_path / 'policy.safetensors')
     assert (read.rail, read.setting, read.training) == (
@@ -127,15 +119,15 @@ def test_a_file_holds_all_of_a_policy(tmp_path: Path):
     ({'window_size': 6}, ('8', '6')), ({'observation': LAYOUT[:-1]}, ('far',))])
 def test_another_setting_is_refused_with_both_named(change, words):
     with pytest.raises(KfvoError) as refusal:
-        PolicyFile(actor(), Rail(), SETTING).policy(replace(SETTING, **change))
+        PolicyFile(random_actor(SIZE), Rail(), SETTING).policy(replace(SETTING, **change))
     assert all(word in str(refusal.value) for word in words)
 
 
 def damage(path: Path, how: str) -> None:
     """Make a policy file a bad one."""
-    PolicyFile(actor(), Rail(), SETTING).write(path)
+    PolicyFile(random_actor(SIZE), Rail(), SETTING).write(path)
     tensors, head = load_file(path), {'format_version': 1}
-    good = PolicyFile(actor(), Rail(), SETTING)
+    good = PolicyFile(random_actor(SIZE), Rail(), SETTING)
     if how == 'cut':
         path.write_bytes(path.read_bytes()[:1000])
     elif how == 'text':
@@ -157,7 +149,7 @@ def damage(path: Path, how: str) -> None:
     elif how == 'no spread':
         replace(good, actor=replace(good.actor, std=np.zeros(SIZE))).write(path)
     elif how == 'wrong size':
-        replace(good, actor=actor(SIZE + 1)).write(path)
+        replace(good, actor=random_actor(SIZE + 1)).write(path)
     elif how == 'no layers':
         replace(good, actor=replace(good.actor, layers=())).write(path)
 
@@ -179,7 +171,8 @@ def test_missing_files_and_folders_are_named(tmp_path: Path):
     with pytest.raises(KfvoError, match='missing.safetensors'):
         read_policy(tmp_path / 'missing.safetensors')
     with pytest.raises(KfvoError, match='cannot write the policy'):
-        PolicyFile(actor(), Rail(), SETTING).write(tmp_path / 'nowhere' / 'policy.safetensors')
+        PolicyFile(random_actor(SIZE), Rail(), SETTING).write(
+            tmp_path / 'nowhere' / 'policy.safetensors')
 
 
 def test_a_policy_runs_with_the_backbone_it_was_trained_with(tmp_path: Path):
@@ -188,13 +181,9 @@ def test_a_policy_runs_with_the_backbone_it_was_trained_with(tmp_path: Path):
     with pytest.raises(KfvoError, match='none came'):
         assembly.make_odometry(replace(options, policy=None))
     setting = assembly.setting_of(options, assembly.make_backbone(options, VggtOptions()))
-    size = sum(size for _, size in setting.observation)
     kept = []
-    for bias in ([-1e6, 1e6], [1e6, -1e6]):  # always keep, and always drop but for the rail
-        numbers = actor(size)
-        last = replace(numbers.layers[-1], bias=np.array(bias, np.float32))
-        PolicyFile(replace(numbers, layers=(*numbers.layers[:-1], last)), Rail(),
-                   setting).write(path)
+    for bias in (ALWAYS, NEVER):
+        write_policy(path, setting, bias)
         odometry = assembly.make_odometry(options)
         kept.append(sum(odometry.process(frame).is_keyframe
                         for frame in SyntheticSequence(3, 'smooth', 40)))

@@ -6,7 +6,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from trajectories import disturbed, freiburg1_rpy, stamps_of, wandering
+from trajectories import (
+    MILLISECOND,
+    disturbed,
+    evo_data,
+    evo_kitti,
+    freiburg1_rpy,
+    stamps_of,
+    wandering,
+)
 
 from kfvo_ros.metrics import (
     absolute_trajectory_error,
@@ -14,7 +22,7 @@ from kfvo_ros.metrics import (
     match,
     relative_pose_error,
 )
-from kfvo_ros.trajectory import Trajectory, read_kitti_poses
+from kfvo_ros.trajectory import Trajectory, read_kitti_poses, read_tum
 
 
 def evo_pair(estimate: Trajectory, truth: Trajectory, with_scale: bool):
@@ -86,3 +94,61 @@ def test_a_car_agrees_with_evo(with_scale, data_path):
     truth = read_kitti_poses(data_path('kitti/poses/03.txt'), stamps_ns)
     assert_agrees_with_evo(disturbed(truth, 1, trans=0.3), truth, with_scale,
                            [(1, 'frames'), (10, 'frames'), (10.0, 'metres'), (100.0, 'metres')])
+
+
+@pytest.mark.parametrize('seed', range(2))
+def test_seconds_are_frames_of_a_regular_camera_to_evo(seed):
+    truth = wandering(seed)
+    stamps_ns = truth.stamps_ns[0] + np.arange(len(truth)) * 50 * MILLISECOND
+    truth = Trajectory(stamps_ns, truth.poses)
+    estimate = disturbed(truth, seed + 100)
+    # But for the last starts, which end at the last pose when that is near enough.
+    count = len(truth) - 20
+    second = relative_pose_error(estimate, truth, 1.0, 'seconds')
+    frames = relative_pose_error(estimate, truth, 20, 'frames')
+    assert_agrees_with_evo(estimate, truth, True, [(20, 'frames')])
+    np.testing.assert_array_equal(second.trans[:count], frames.trans)
+    np.testing.assert_array_equal(second.rot_deg[:count], frames.rot_deg)
+
+
+# What evo itself is tested with: published estimates and their ground truth
+
+
+@pytest.mark.parametrize('with_scale', [True, False], ids=['sim3', 'se3'])
+@pytest.mark.parametrize('estimate, truth', [
+    ('freiburg1_xyz-rgbdslam', 'freiburg1_xyz-groundtruth'),
+    ('freiburg1_xyz-rgbdslam_drift', 'freiburg1_xyz-groundtruth'),
+    ('freiburg1_xyz-ORB_kf_mono', 'freiburg1_xyz-groundtruth'),
+    ('fr2_desk_ORB', 'fr2_desk_groundtruth'), ('fr2_desk_ORB_kf_mono', 'fr2_desk_groundtruth')])
+def test_published_hand_held_estimates_agree_with_evo(estimate, truth, with_scale):
+    estimate, truth = match(*(read_tum(evo_data(f'{name}.txt')) for name in (estimate, truth)))
+    assert_agrees_with_evo(estimate, truth, with_scale,
+                           [(1, 'frames'), (10, 'frames'), (0.5, 'metres'), (1.0, 'metres')])
+
+
+@pytest.mark.parametrize('with_scale', [True, False], ids=['sim3', 'se3'])
+@pytest.mark.parametrize('name', ['ORB', 'SPTAM'])
+def test_published_estimates_of_a_car_agree_with_evo(name, with_scale):
+    assert_agrees_with_evo(evo_kitti(name), evo_kitti('gt'), with_scale,
+                           [(1, 'frames'), (10, 'frames'), (1.0, 'metres'), (100.0, 'metres')])
+
+
+def test_published_estimates_of_a_drone_agree_with_evo():
+    files = pytest.importorskip('evo.tools.file_interface', reason='evo is not installed')
+    measured = files.read_euroc_csv_trajectory(str(evo_data('V102_groundtruth.csv')))
+    stamps_ns = np.rint(measured.timestamps * 1e6).astype(np.int64) * 1000
+    truth = Trajectory(stamps_ns, np.array(measured.poses_se3))
+    estimate, truth = match(read_tum(evo_data('V102.txt')), truth)
+    assert_agrees_with_evo(estimate, truth, True, [(1, 'frames'), (1.0, 'metres')])
+
+
+@pytest.mark.parametrize('estimate, truth', [
+    ('freiburg1_xyz-rgbdslam', 'freiburg1_xyz-groundtruth'),
+    ('fr2_desk_ORB', 'fr2_desk_groundtruth')])
+def test_published_estimates_are_matched_as_evo_matches_them(estimate, truth):
+    sync = pytest.importorskip('evo.core.sync', reason='evo is not installed')
+    estimate, truth = (read_tum(evo_data(f'{name}.txt')) for name in (estimate, truth))
+    matched, evos = match(estimate, truth), sync.matching_time_indices(
+        estimate.stamps_ns / 1e9, truth.stamps_ns / 1e9, max_diff=0.01)
+    np.testing.assert_array_equal(matched[0].stamps_ns, estimate.stamps_ns[evos[0]])
+    np.testing.assert_array_equal(matched[1].stamps_ns, truth.stamps_ns[evos[1]])

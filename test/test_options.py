@@ -21,6 +21,7 @@ from kfvo_ros.options import (
     VggtOptions,
     add_arguments,
     from_arguments,
+    to_arguments,
 )
 from kfvo_ros.scale import SCALE_RULES
 
@@ -67,6 +68,7 @@ def test_every_field_goes_through_the_command_line(options):
     assert parsed == wanted
     assert [type(value) for value in asdict(parsed).values()] == [
         type(value) for value in asdict(wanted).values()]
+    assert parse(options, *to_arguments(wanted)) == wanted
 
 
 @pytest.mark.parametrize(('options', 'arguments', 'complaint'), [
@@ -141,6 +143,16 @@ def test_what_is_left_out_is_no_option_and_keeps_its_default():
     assert '--keyframes' not in parser.format_help() and '--seed' in parser.format_help()
     options = from_arguments(OdometryOptions, parser.parse_args(['--seed', '5']))
     assert options == OdometryOptions(seed=5)
+
+
+def test_options_become_the_command_line_that_gives_them():
+    assert to_arguments(OdometryOptions()) == []
+    assert to_arguments(OdometryOptions(scale_rule='none', seed=3), without=('seed',)) == [
+        '--scale=none']
+    transform = SequenceOptions(ground_truth_to_camera='-1 0 0 0 0 0 1')
+    assert parse(SequenceOptions, *to_arguments(transform)) == transform
+    topics = PlayOptions(topic=('/a', '/b'), loop=True)
+    assert to_arguments(topics) == ['--topic=/a', '--topic=/b', '--loop']
 
 
 def test_options_cannot_be_changed():

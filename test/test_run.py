@@ -41,10 +41,7 @@ def images(tmp_path_factory) -> Path:
     for index, frame in enumerate(frames):
         cv2.imwrite(str(folder / f'{index}.png'), frame.image)
     camera = frames[0].camera
-    write_camera_info(folder, camera.fx, camera.width, camera.height)
-    text = (folder / 'camera_info.yaml').read_text()
-    (folder / 'camera_info.yaml').write_text(
-        text.replace(' 16,', f' {camera.cx},').replace(' 12,', f' {camera.cy},'))
+    write_camera_info(folder, camera.fx, camera.width, camera.height, camera.cx, camera.cy)
     return folder
 
 

@@ -4,14 +4,16 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from kfvo_ros import geometry
 from kfvo_ros.geometry import Similarity
-from kfvo_ros.trajectory import Trajectory, parse_stamp_ns, read_tum
+from kfvo_ros.trajectory import Trajectory, parse_stamp_ns, read_kitti_poses, read_tum
 
 EPOCH_NS = 1_403_715_273_262_142_976
 MILLISECOND = 1_000_000
@@ -65,3 +67,19 @@ def freiburg1_rpy(data_path: Callable[[str], Path]) -> tuple[np.ndarray, Traject
     """Return the stamps of the frames and the ground truth, or skip the test."""
     folder = data_path('tum/rgbd_dataset_freiburg1_rpy')
     return stamps_of(folder / 'rgb.txt'), read_tum(folder / 'groundtruth.txt')
+
+
+def evo_data(name: str) -> Path:
+    """Return one of the published trajectories that evo is tested with, or skip the test."""
+    evo = pytest.importorskip('evo', reason='evo is not installed')
+    folder = Path(os.environ.get('EVO_DATA') or Path(evo.__file__).parents[1] / 'test' / 'data')
+    if not (folder / name).exists():
+        pytest.skip("evo's trajectories are not in its wheel: let EVO_DATA name the folder "
+                    'test/data of its source (pip download --no-deps --no-binary :all: evo)')
+    return folder / name
+
+
+def evo_kitti(name: str) -> Trajectory:
+    """Return KITTI 00, its ground truth (``gt``) or an estimate, or skip the test."""
+    return read_kitti_poses(evo_data(f'KITTI_00_{name}.txt'),
+                            stamps_of(evo_data('KITTI_00_gt_times.txt')))

@@ -12,8 +12,8 @@ make one batch.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any
 
@@ -102,7 +102,9 @@ class Estimate:
     unit per window; ``covariance`` (S, 6, 6) of each pose in the anchor, translation first,
     then rotation [rad]; ``points`` or None; ``signals`` (len(signal_names),) float32 for the
     policy; ``status`` of the newest frame; ``memory`` comes back in the next `Previous`;
-    ``intrinsics`` K (3, 3) of the newest image [px] from a model that estimates them.
+    ``intrinsics`` K (3, 3) of the newest image [px] from a model that estimates them;
+    ``durations`` [s] of parts of the call that people compare, such as ``head``, of a batch
+    the window's share.
     """
 
     T_anchor_frame: np.ndarray
@@ -112,6 +114,7 @@ class Estimate:
     status: Status = Status.OK
     memory: Any = None
     intrinsics: np.ndarray | None = None
+    durations: Mapping[str, float] = field(default_factory=dict)
 
 
 def lost(window: Window, signal_count: int = 0, memory: Any = None) -> Estimate:

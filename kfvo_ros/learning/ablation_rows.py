@@ -7,7 +7,6 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from kfvo_ros.errors import KfvoError
 from kfvo_ros.learning.recipe import Recipe
 from kfvo_ros.learning.reward import ALPHA
 
@@ -30,15 +29,6 @@ ROWS: dict[str, dict[str, Any]] = {
 """Rows against `FULL`, which is reward and observation of the paper: the mean descriptor and the
 relative poses, not the backbone's signals; and our own reward on all that can be seen, on the
 signals alone, and from nothing instead of from a teacher."""
-
-
-def row_names(text: str) -> tuple[str, ...]:
-    """Return the rows named in ``a,b,...``, each once; raises KfvoError for any other word."""
-    names = tuple(dict.fromkeys(text.split(',')))
-    for name in names:
-        if name not in ROWS:
-            raise KfvoError(f'rows: expected names out of {", ".join(ROWS)}, came {name!r}')
-    return names
 
 
 def row_recipe(name: str, recipe: Recipe, steps: int) -> Recipe:

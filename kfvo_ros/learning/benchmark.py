@@ -24,11 +24,11 @@ from kfvo_ros import assembly
 from kfvo_ros.backbones.base import Backbone, Estimate, Window
 from kfvo_ros.backbones.geometric.backbone import GeometricBackbone
 from kfvo_ros.commands import make_parser, run_command
-from kfvo_ros.errors import KfvoError
 from kfvo_ros.learning.plan import Choices
 from kfvo_ros.learning.recipe import Recipe, read_recipe
 from kfvo_ros.learning.school import Lesson, make_environment
 from kfvo_ros.learning.training import make_model
+from kfvo_ros.lists import numbers_in
 from kfvo_ros.options import (
     OdometryOptions,
     SequenceOptions,
@@ -101,7 +101,7 @@ def _run(argv: list[str]) -> None:
     add_arguments(parser, BenchmarkOptions)
     arguments = parser.parse_args(argv)
     options = from_arguments(BenchmarkOptions, arguments)
-    counts, (load, *_) = _counts(options.workers), os.getloadavg()
+    counts, (load, *_) = numbers_in(options.workers, 'workers', 1), os.getloadavg()
     with single_threaded(), tempfile.TemporaryDirectory() as folder:
         lesson, recipe = _prepare(spelled_out(arguments.sequence), options,
                                   Path(options.cache or folder).expanduser())
@@ -110,15 +110,6 @@ def _run(argv: list[str]) -> None:
     print(f'{os.cpu_count()} cores (load {load:.1f} before), {recipe.environments} environments '
           f'on {len(lesson.sequences)} sequences, {frames:.2f} frames a decision')
     print(table(speeds, frames))
-
-
-def _counts(text: str) -> tuple[int, ...]:
-    """Return the numbers of workers in ``a,b,...``; raises KfvoError."""
-    parts = text.split(',')
-    if not all(part.isascii() and part.isdigit() and int(part) for part in parts):
-        raise KfvoError('workers: expected whole numbers from 1 with commas in between, came '
-                        f'{text!r}')
-    return tuple(map(int, parts))
 
 
 def _prepare(sequences: tuple[str, ...], options: BenchmarkOptions,

@@ -16,11 +16,9 @@ from matplotlib.ticker import LogLocator
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from kfvo_ros.keyframes import HEURISTICS
+from kfvo_ros.plots import COLOURS, save, tidy
 
 ERROR, RETURN = 'validation_ate_percent/', 'rollout/ep_rew_mean'
-COLOURS = ('#000000', '#0072b2', '#d55e00', '#009e73', '#cc79a7', '#e69f00', '#56b4e9',
-           '#8c564b')
-"""Okabe and Ito's, which nearly all eyes tell apart."""
 DASHES = dict(zip(HEURISTICS, (':', '--', '-.'), strict=True))
 
 
@@ -60,7 +58,7 @@ def plot_curves(path: Path, curves: Sequence[Curve]) -> None:
     rewards = tuple(dict.fromkeys(curve.reward for curve in curves))
     rows = tuple(dict.fromkeys(curve.row for curve in curves))
     colours = {row: COLOURS[number % len(COLOURS)] for number, row in enumerate(rows)}
-    figure = Figure(figsize=(5.5 * (1 + len(rewards)) + 1.5, 5.0), dpi=150,
+    figure = Figure(figsize=(5.5 * (1 + len(rewards)) + 1.5, 5.0),
                     layout=ConstrainedLayoutEngine(w_pad=0.15))
     first, *others = figure.subplots(1, 1 + len(rewards), squeeze=False)[0]
     _draw(first, colours, [(curve.row, curve.errors) for curve in curves])
@@ -76,7 +74,7 @@ def plot_curves(path: Path, curves: Sequence[Curve]) -> None:
     handles, labels = first.get_legend_handles_labels()
     (others or [first])[-1].legend(handles, labels, loc='upper left', bbox_to_anchor=(1.02, 1.0),
                                    frameon=False)
-    figure.savefig(path)
+    save(figure, path)
 
 
 def _draw(axes: Any, colours: dict[str, str], lines: Sequence[tuple[str, np.ndarray]]) -> None:
@@ -87,8 +85,7 @@ def _draw(axes: Any, colours: dict[str, str], lines: Sequence[tuple[str, np.ndar
         axes.plot(*_median(seeds), color=colours[row], linewidth=2.2, marker='.', markersize=4.0,
                   label=row)
     axes.set(xlabel='decisions learned from')
-    axes.grid(alpha=0.25, which='both')
-    axes.spines[['top', 'right']].set_visible(False)
+    tidy(axes)
 
 
 def _median(seeds: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

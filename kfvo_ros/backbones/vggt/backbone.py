@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
+from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
@@ -15,6 +16,7 @@ from kfvo_ros.backbones.base import Backbone, Encoded, Estimate, Stream, Window,
 from kfvo_ros.backbones.vggt import pose_encoding
 from kfvo_ros.backbones.vggt.aggregator import grid_of
 from kfvo_ros.backbones.vggt.config import PATCH, SPECIAL
+from kfvo_ros.backbones.vggt.device_time import DeviceTime
 from kfvo_ros.backbones.vggt.memory import FrameMemory, features_anew, features_reusing
 from kfvo_ros.backbones.vggt.model import Vggt
 from kfvo_ros.backbones.vggt.out_of_memory import memory_bounded
@@ -95,10 +97,7 @@ class VggtBackbone(Backbone):
 
     def encodings(self, windows: Sequence[Window]) -> np.ndarray:
         """Return pose encodings (iterations, B, S, 9) of windows of one size."""
-        frames = [[encoded.payload for encoded in window.frames] for window in windows]
-        features = features_reusing if self.reuse else features_anew
-        with torch.inference_mode(), memory_bounded(self.device):
-            return self.model.camera_head(features(self.model.aggregator, frames)).cpu().numpy()
+        return self._infer(windows)[0]
 
     def condition(self) -> dict[str, str]:
         """Return device, numbers and what the device's memory holds."""
@@ -125,8 +124,20 @@ class VggtBackbone(Backbone):
 
     def _place(self, windows: Sequence[Window]) -> list[Estimate]:
         """Estimate windows of one size."""
-        encodings = self.encodings(windows)
-        return [_estimate(window, encodings[:, index]) for index, window in enumerate(windows)]
+        encodings, head_s = self._infer(windows)
+        return [replace(_estimate(window, encodings[:, index]),
+                        durations={'head': head_s / len(windows)})
+                for index, window in enumerate(windows)]
+
+    def _infer(self, windows: Sequence[Window]) -> tuple[np.ndarray, float]:
+        """Return the encodings of windows of one size, and how long the head took [s]."""
+        frames = [[encoded.payload for encoded in window.frames] for window in windows]
+        features = features_reusing if self.reuse else features_anew
+        with torch.inference_mode(), memory_bounded(self.device):
+            seen = features(self.model.aggregator, frames)
+            with DeviceTime(self.device) as head:
+                encodings = self.model.camera_head(seen)
+            return encodings.cpu().numpy(), head.seconds
 
 
 def _stream_of(stream: Stream) -> VggtStream:

@@ -1,0 +1,285 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""``python -m kfvo_ros.benchmark`` as users start it: runs that end well, badly and not at all."""
+
+from __future__ import annotations
+
+import csv
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from command_lines import ENVIRONMENT, assert_one_readable_line, run_python
+from odometry_scenes import frames_of, truth_of
+from policies import ALWAYS, write_policy
+from sequence_writers import write_camera_info, write_image, write_kitti
+
+pytest.importorskip('matplotlib', reason="matplotlib is not installed: pip install '.[demo]'")
+
+from kfvo_ros import assembly, benchmark
+from kfvo_ros.keyframes.learned import Setting
+from kfvo_ros.metrics import absolute_trajectory_error
+from kfvo_ros.options import OdometryOptions
+from kfvo_ros.sequences import open_sequence
+from kfvo_ros.trajectory import read_tum
+
+pytestmark = pytest.mark.usefixtures('own_signals')
+
+COUNT = 16
+METHODS = ('every', 'learned')
+PROMISED = ['sequence', 'method', 'backbone', 'scale_rule', 'frames', 'keyframes', 'ate_rmse_m',
+            'path_length_m', 'ate_percent', 'rpe_trans', 'rpe_rot_deg', 'ms_per_frame', 'seed']
+PAGES = ('results.md', 'results.tex', 'results.html', 'trajectories.png', 'errors.png')
+
+
+def rows_of(folder: Path) -> list[dict[str, str]]:
+    with (folder / 'results.csv').open(newline='') as file:
+        return list(csv.DictReader(file))
+
+
+def write_room(root: Path) -> Path:
+    """Write a rendered room as KITTI's sequence 03."""
+    frames = frames_of(1, COUNT)
+    folder, _ = write_kitti(root, [frame.image for frame in frames], truth_of(1, COUNT).poses)
+    camera = frames[0].camera
+    write_camera_info(folder, camera.fx, camera.width, camera.height, camera.cx, camera.cy)
+    return folder
+
+
+@pytest.fixture(scope='module')
+def sequences(tmp_path_factory) -> list[Path]:
+    """Return one that is sound, one with a broken image and one without truth."""
+    root = tmp_path_factory.mktemp('data')
+    sound = write_room(root)
+    broken, untrue = sound.with_name('04'), root / 'untrue'
+    shutil.copytree(sound, broken)
+    (broken / 'image_0' / '000012.png').write_bytes(b'no image')
+    untrue.mkdir()
+    write_camera_info(untrue, 30.0)
+    for index in range(2):
+        write_image(untrue / f'{index}.png', frames_of(1, COUNT)[0].image[:24, :32])
+    return [sound, broken, untrue]
+
+
+@pytest.fixture(scope='module')
+def policy(tmp_path_factory) -> Path:
+    """Return a policy that keeps every frame."""
+    options = OdometryOptions()
+    setting = assembly.setting_of(options, assembly.make_backbone(options))
+    return write_policy(tmp_path_factory.mktemp('policy') / 'p.safetensors', setting, ALWAYS)
+
+
+@pytest.fixture(scope='module')
+def done(sequences, policy, tmp_path_factory) -> tuple[Path, subprocess.CompletedProcess[str]]:
+    folder = tmp_path_factory.mktemp('results')
+    return folder, run_python(*command(sequences, policy, folder))
+
+
+def command(sequences: list[Path], policy: Path, folder: Path, *more: object) -> list[object]:
+    return ['-m', 'kfvo_ros.benchmark', *sequences, '--methods', ','.join(METHODS), '--policy',
+            policy, '--output', folder, *more]
+
+
+def test_a_row_for_each_run_and_two_that_never_look(done):
+    folder, outcome = done
+    assert outcome.returncode == 0, outcome.stderr
+    rows = rows_of(folder)
+    assert list(rows[0])[:len(PROMISED)] == PROMISED
+    assert [(row['sequence'], row['method'], row['status']) for row in rows] == [
+        ('kitti/03', 'every', 'finished'), ('kitti/03', 'learned', 'finished'),
+        ('kitti/03', 'constant_position', 'finished'), ('kitti/03', 'straight_line', 'finished'),
+        ('kitti/04', 'every', 'failed'), ('kitti/04', 'learned', 'failed'),
+        ('untrue', 'every', 'finished'), ('untrue', 'learned', 'finished')]
+    for row in rows[:2]:
+        assert (row['backbone'], row['scale_rule'], row['seed']) == ('geometric', 'depth', '0')
+        assert row['frames'] == row['keyframes'] == str(COUNT)
+        assert 0.0 < float(row['ate_percent']) < 5.0
+        assert float(row['encode_ms']) > 0.0 and row['head_ms'] == '' and row['jobs'] == '1'
+    assert rows[2]['seed'] == rows[2]['backbone'] == rows[2]['ms_per_frame'] == ''
+    assert float(rows[2]['ate_rmse_m']) > 10.0 * float(rows[0]['ate_rmse_m'])
+
+
+def test_the_error_is_that_of_the_files_of_the_run(done, sequences):
+    folder = done[0] / 'runs' / 'kitti_03' / 'every' / '0'
+    truth = open_sequence(str(sequences[0])).ground_truth().trajectory
+    error = absolute_trajectory_error(read_tum(folder / 'trajectory.tum'), truth)
+    assert float(rows_of(done[0])[0]['ate_rmse_m']) == pytest.approx(error.rmse, rel=1e-12)
+    assert {'keyframes.tum', 'summary.json'} <= {path.name for path in folder.iterdir()}
+
+
+def test_what_failed_says_why_and_the_others_go_on(done):
+    folder, outcome = done
+    failed = rows_of(folder)[4]
+    assert '000012.png' in failed['problem'] and failed['ate_rmse_m'] == ''
+    assert 'kitti/04, every, seed 0: ' in outcome.stderr
+    assert '4 of 6 runs finished' in outcome.stdout
+    assert rows_of(folder)[6]['problem'] == 'no ground truth'
+
+
+def test_pages(done):
+    folder, outcome = done
+    for name in PAGES:
+        assert (folder / name).stat().st_size > 0, name
+    page = (folder / 'results.md').read_text()
+    for part in ('| every | ✗ | No |', '| learned | ✓ | No |',
+                 '| FastVGGT (published) | ✗ | No | 11.2 | 2.5 | 11.2 |',
+                 'Avg: over 03, which all rows have.', 'loop closure', 'learned: p.safetensors',
+                 '000012.png', '--methods every,learned', '![trajectories](trajectories.png)'):
+        assert part in page, part
+    assert 'VGGT-LK is optical_flow' in page and '| every | ✗ |' in outcome.stdout
+    assert str(folder) not in page.replace(str(folder / 'runs'), '')
+
+
+def test_resuming_runs_only_what_is_not_finished(done, sequences, policy, tmp_path):
+    folder = tmp_path / 'results'
+    shutil.copytree(done[0], folder)
+    runs = [folder / 'runs' / name / 'every' / '0' for name in ('kitti_03', 'kitti_04', 'untrue')]
+    before = [(run / 'request.json').stat().st_mtime_ns for run in runs]
+    again = run_python(*command(sequences, policy, folder, '--resume', '--no-pictures'))
+    assert again.returncode == 0, again.stderr
+    after = [(run / 'request.json').stat().st_mtime_ns for run in runs]
+    assert [old == new for old, new in zip(before, after)] == [True, False, True]
+    for old, new in zip(rows_of(done[0]), rows_of(folder), strict=True):
+        changing = [name for name in old if 'ms' in name or name == 'peak_rss_mb']
+        assert [old[name] for name in old if name not in changing] == [
+            new[name] for name in new if name not in changing]
+
+
+@pytest.mark.parametrize(('more', 'part'), [
+    (['--resume', '--window-size', '6'], '--window-size'), ([], 'already holds results.csv'),
+    (['--resume', '--overwrite'], 'both came')])
+def test_results_of_something_else_are_not_mixed_in(more, part, done, sequences, policy, capsys):
+    folder = done[0]
+    before = (folder / 'results.csv').read_bytes()
+    methods = ['--methods', 'every'] if more else []
+    arguments = [str(sequences[0]), *methods, '--output', str(folder), *more]
+    try:
+        status = benchmark.main(arguments)
+    except SystemExit as ending:
+        status = ending.code
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert status != 0 and part in line
+    assert (folder / 'results.csv').read_bytes() == before
+
+
+def test_another_policy_of_the_same_name_is_something_else(done, sequences, policy, capsys):
+    kept = policy.read_bytes()
+    try:
+        write_policy(policy, Setting('geometric', 'depth', 8, (('gap', 1),)), ALWAYS)
+        arguments = command(sequences[:1], policy, done[0], '--resume')[2:]
+        assert benchmark.main([str(each) for each in arguments]) == 1
+    finally:
+        policy.write_bytes(kept)
+    assert 'is of another policy' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(('arguments', 'part'), [
+    (['/no/such/place'], '/no/such/place does not exist'),
+    (['synthetic:0', '--methods', 'often'], "survival, learned, came 'often'"),
+    (['synthetic:0', '--methods', 'every,'], "came ''"),
+    (['synthetic:0', '--seeds', '1,x'], "seeds: expected whole numbers from 0 with commas in "
+     "between, came '1,x'"),
+    (['synthetic:0', '--methods', 'learned'], 'name one with --policy'),
+    (['synthetic:0', '--policy', 'p.safetensors', '--methods', 'every'], 'not among the methods'),
+    (['synthetic:0', '--policy', '/no/policy'], 'cannot read the policy /no/policy'),
+    (['synthetic:9-1'], 'synthetic:A-B'),
+    (['synthetic:0', '--camera', '/no/camera.yaml'], '/no/camera.yaml')])
+def test_what_cannot_be_is_told_before_anything_runs(arguments, part, tmp_path, capsys):
+    assert benchmark.main([*arguments, '--output', str(tmp_path / 'out')]) == 1
+    problems = capsys.readouterr().err.splitlines()
+    assert len(problems) == 1 and part in problems[0]
+    assert not (tmp_path / 'out' / 'runs').exists()
+
+
+def test_a_policy_for_something_else(policy, tmp_path, capsys):
+    assert benchmark.main(['synthetic:0', '--policy', str(policy), '--window-size', '6',
+                           '--output', str(tmp_path / 'out')]) == 1
+    assert 'window_size 8' in capsys.readouterr().err
+
+
+def test_a_folder_that_cannot_be_written(tmp_path, capsys):
+    (tmp_path / 'file').write_text('in the way')
+    assert benchmark.main(['synthetic:0', '--output', str(tmp_path / 'file' / 'out')]) == 1
+    assert 'file/out' in capsys.readouterr().err
+
+
+def test_without_matplotlib_the_line_comes_at_once(tmp_path):
+    script = ("import sys; sys.modules['matplotlib'] = None; "
+              'from kfvo_ros.benchmark import main; sys.exit(main())')
+    outcome = run_python('-c', script, 'synthetic:0', '--output', tmp_path / 'out')
+    assert_one_readable_line(outcome, 'matplotlib is missing: pip install matplotlib')
+    assert not (tmp_path / 'out').exists()
+
+
+# What is not let to its end
+
+
+def children_of(process: subprocess.Popen[str]) -> list[int]:
+    found = []
+    for path in Path('/proc').glob('[0-9]*/stat'):
+        try:
+            _, _, fields = path.read_text().rpartition(')')
+        except OSError:  # it has just ended
+            continue
+        if int(fields.split()[1]) == process.pid and fields.split()[0] != 'Z':
+            found.append(int(path.parent.name))
+    return found
+
+
+@contextmanager
+def started(folder: Path, methods: str) -> Iterator[subprocess.Popen[str]]:
+    """Start a benchmark in a process group of its own, as terminals do."""
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'kfvo_ros.benchmark', 'synthetic:1:smooth', '--stop', '40',
+         '--methods', methods, '--no-pictures', '--output', str(folder)], text=True,
+        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, env=ENVIRONMENT,
+        start_new_session=True)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def child_at_work(process: subprocess.Popen[str], folder: Path, method: str) -> int:
+    """Wait until a method has placed frames; return its process."""
+    path = folder / 'runs' / 'synthetic_1_smooth' / method / '0' / 'trajectory.tum'
+    patience = time.monotonic() + 60.0
+    while not (path.exists() and path.read_text().count('\n') >= 3):
+        assert time.monotonic() < patience and process.poll() is None
+        time.sleep(0.01)
+    child, = children_of(process)
+    return child
+
+
+def test_what_is_killed_is_a_row_and_ctrl_c_keeps_the_rows(tmp_path):
+    with started(tmp_path, 'every,optical_flow,survival') as process:
+        os.kill(child_at_work(process, tmp_path, 'every'), signal.SIGKILL)
+        last = child_at_work(process, tmp_path, 'survival')
+        os.killpg(process.pid, signal.SIGINT)  # a terminal sends it to the children too
+        problems = process.communicate(timeout=30.0)[1]
+    assert process.returncode == 1 and 'Traceback' not in problems
+    line = problems.splitlines()[-1]
+    assert 'error: interrupted after 2 of 3 runs' in line and '--resume' in line
+    rows = rows_of(tmp_path)
+    assert [(row['method'], row['status']) for row in rows] == [
+        ('every', 'failed'), ('optical_flow', 'finished'), ('constant_position', 'finished'),
+        ('straight_line', 'finished')]
+    assert rows[0]['problem'] == 'the process was ended by SIGKILL'
+    assert not Path('/proc', str(last)).exists()
+
+
+def test_no_process_outlives_a_benchmark_that_is_ended(tmp_path):
+    with started(tmp_path, 'every,survival') as process:
+        child = child_at_work(process, tmp_path, 'every')
+        process.terminate()
+        problems = process.communicate(timeout=30.0)[1]
+    assert process.returncode == 1 and 'interrupted after 0 of 2 runs' in problems
+    assert rows_of(tmp_path) == [] and not Path('/proc', str(child)).exists()
