@@ -11,6 +11,7 @@ import pytest
 pytest.importorskip('stable_baselines3', reason="stable-baselines3 is not installed: pip install "
                     "'.[train]'")
 
+import numpy as np
 import torch
 
 from kfvo_ros.backbones.geometric.backbone import GeometricBackbone
@@ -19,10 +20,11 @@ from kfvo_ros.learning import imitation
 from kfvo_ros.learning.plan import Choices
 from kfvo_ros.learning.recipe import read_recipe
 from kfvo_ros.learning.school import make_environment
+from kfvo_ros.learning.teacher import Teacher
 from kfvo_ros.learning.training import make_model
 from kfvo_ros.options import OdometryOptions, SequenceOptions, VggtOptions
 
-SHARE = 0.85
+TEACHER = Teacher(flow=12.0, survival=0.6)
 
 
 def choices(**changes) -> Choices:
@@ -39,11 +41,12 @@ def test_the_actor_decides_as_its_teacher_did_and_the_critic_knows_what_it_is_wo
     environment = make_environment(chosen.lesson(plan), 2, 1, 0)
     model = make_model(environment, plan.recipe, 0)
     asked = []
-    imitation.imitate(model, plan.setting.observation, SHARE, lambda: asked.append(None))
+    imitation.imitate(model, plan.setting.observation, TEACHER, lambda: asked.append(None))
     assert len(asked) == 160
 
-    seen, kept, returns = imitation._watch(model.get_vec_normalize_env(), 49, SHARE, model.gamma,
-                                           lambda: None)
+    seen, kept, returns = imitation._watch(
+        model.get_vec_normalize_env(), plan.setting.observation, TEACHER, model.gamma,
+        lambda: None)
     with torch.no_grad():
         chances = model.policy.get_distribution(seen).distribution.probs[:, 1]
         values = model.policy.predict_values(seen).flatten()
@@ -53,9 +56,17 @@ def test_the_actor_decides_as_its_teacher_did_and_the_critic_knows_what_it_is_wo
     assert ((values - returns) ** 2).mean() < 0.25 * (returns ** 2).mean()
 
 
+def test_the_teacher_keeps_after_enough_flow_and_when_tracks_are_lost():
+    layout = (('poses', 2), ('track_survival', 1), ('flow', 1))
+    seen = np.array([[9.0, 9.0, 0.9, np.log1p(flow)] for flow in (0.0, 11.9, 12.1)]
+                    + [[0.0, 0.0, 0.59, 0.0]])
+    assert TEACHER.decide(seen, layout).tolist() == [0, 0, 1, 1]
+
+
 def test_without_what_the_teacher_looks_at_nobody_can_be_imitated():
-    for without in (('signals',), ('track_survival',)):
-        with pytest.raises(KfvoError, match='teacher: expected null where track_survival'):
+    for without, missing in ((('signals',), 'flow and track_survival'),
+                             (('track_survival',), 'track_survival')):
+        with pytest.raises(KfvoError, match=f'teacher: .* does not observe {missing}$'):
             choices(without=without).plan(['synthetic:1'], [], GeometricBackbone())
     assert choices(without=('signals',), teacher=None).plan(
         ['synthetic:1'], [], GeometricBackbone()).recipe.teacher is None

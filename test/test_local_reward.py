@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from kfvo_ros import geometry
-from kfvo_ros.learning.local_reward import LEAST_SPAN, MOST, LocalReward
+from kfvo_ros.learning.local_reward import LEAST_SPAN, MOST, LocalReward, standing_of
 
 FRAMES = 100
 
@@ -26,20 +26,31 @@ def drifting(truth: np.ndarray, drift: float) -> np.ndarray:
                                    3.0 * grown.cumsum(axis=0) @ geometry.exp_so3([1.0, 0.2, 0.3]))
 
 
+def standing(estimate: np.ndarray, truth: np.ndarray) -> float:
+    return standing_of(estimate[:, :3, 3], truth[:, :3, 3])
+
+
 def test_drift_of_scale_is_charged_on_a_log_scale():
-    truth, reward = walk(), LocalReward(FRAMES)
-    worths = [reward(drifting(truth, drift), truth, True) for drift in (0.1, 0.2, 0.4)]
-    assert worths[0] > worths[1] > worths[2]
-    assert worths[0] - worths[1] == pytest.approx(np.log(2.0), abs=0.1)
+    truth = walk()
+    standings = [standing(drifting(truth, drift), truth) for drift in (0.1, 0.2, 0.4)]
+    assert standings[0] > standings[1] > standings[2]
+    assert standings[0] - standings[1] == pytest.approx(np.log(2.0), abs=0.1)
+
+
+def test_what_changes_is_rewarded_and_all_rewards_sum_up_to_where_one_stands():
+    truth, reward = walk(), LocalReward(FRAMES, alpha=-0.25)
+    good, bad = drifting(truth, 0.1), drifting(truth, 0.4)
+    rewards = [reward(poses, truth, False) for poses in (good, bad, bad, good)]
+    assert rewards[0] == pytest.approx(standing(good, truth)) and rewards[1] < -1.0
+    assert rewards[2] == 0.0 and rewards[3] == -rewards[1]
+    assert sum(rewards) == pytest.approx(reward.standing)
+    assert reward(good, truth, True) == -0.25
 
 
 def test_it_is_bounded_and_right_or_wrong_alike():
-    truth, reward = walk(), LocalReward(FRAMES)
-    assert reward(truth, truth, True) == MOST
-    assert reward(drifting(truth, 20.0), truth, True) == -MOST
-    at_rest = np.tile(np.eye(4), (FRAMES, 1, 1))
-    assert reward(at_rest, at_rest, False) == MOST
-    assert reward(at_rest, truth, False) == -MOST
+    truth, at_rest = walk(), np.tile(np.eye(4), (FRAMES, 1, 1))
+    assert standing(truth, truth) == standing(at_rest, at_rest) == MOST
+    assert standing(drifting(truth, 20.0), truth) == standing(at_rest, truth) == -MOST
 
 
 def test_a_window_s_length_says_nothing():

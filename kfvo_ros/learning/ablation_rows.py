@@ -11,7 +11,7 @@ from kfvo_ros.learning.recipe import Recipe
 from kfvo_ros.learning.reward import ALPHA
 
 FULL = 'full'
-VALIDATIONS = 10
+VALIDATIONS = 8
 """A learning curve has so many points or more."""
 
 _PAPER: dict[str, Any] = {'reward': 'paper', 'alpha': ALPHA, 'without': ('signals',),

@@ -42,7 +42,7 @@ class Episode:
         self.decision: DecisionInput | None = None
         self.ended = False
         self._asked = False
-        self._earned = self._last_worth = 0.0
+        self._earned = 0.0
 
     def unseen(self) -> tuple[Stream, Frame] | None:
         """Return the next frame, and its stream, where it has to be encoded first."""
@@ -74,8 +74,8 @@ class Episode:
         """Keep or drop the frame, and earn what that is worth."""
         window = self._window() if self._reward.span is None else None
         self._commit(keep)
-        self._last_worth = self._reward(*(window or self._recent()), keep)
-        self._earned += self._last_worth if self._asked else 0.0
+        worth = self._reward(*(window or self._recent()), keep)
+        self._earned += worth if self._asked else 0.0
         self.decision = None
         self.ended = self._next == len(self._drive)
 
@@ -88,8 +88,8 @@ class Episode:
         """Return what only the critic sees (PRIVILEGED_SIZE,): the true motion, and the next.
 
         From the last keyframe to the newest frame, then frame by frame, in the trajectory's unit,
-        each (t, quat_xyzw); past the end zeros, and a flag of 1. At last what the decision before
-        was worth: most of what is to come is known from where one stands.
+        each (t, quat_xyzw); past the end zeros, and a flag of 1. At last how good the trajectory
+        is so far: one that is bad already has less to lose.
         """
         estimated, true = self._window()
         scale = align(estimated[:ALIGNED], true[:ALIGNED], 1.0).scale
@@ -100,7 +100,7 @@ class Episode:
         told[:len(motions), :3] = motions[:, :3, 3] / max(scale, 1e-9)
         told[:len(motions), 3:] = geometry.quat_xyzw_from_rotation(motions[:, :3, :3])
         return np.append(told, [np.float32(len(motions) < len(told)),
-                                np.float32(self._last_worth)])
+                                np.float32(self._reward.standing)])
 
     def _commit(self, keep: bool) -> None:
         self._odometry.commit(keep, {})

@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A start for PPO: the decisions of `survival`, and what they are worth.
+"""A start for PPO: the decisions of a teacher, and what they are worth.
 
 From nothing a policy keeps every second frame by chance. That is far from any good policy, and
 what a single decision changes there is lost in the noise of all the others.
@@ -20,26 +20,24 @@ from torch.nn.functional import mse_loss
 from kfvo_ros.keyframes.observation import Layout
 from kfvo_ros.learning.actor_critic import PrivilegedCritic
 from kfvo_ros.learning.environment import OBSERVATION, Observations
+from kfvo_ros.learning.teacher import Teacher
 
-SURVIVAL = 'track_survival'
-"""The part of the observation that the teacher looks at."""
 STEPS = 256
 PASSES, BATCH, LEARNING_RATE = 24, 256, 1e-3
 CERTAINTY = 0.9
 """So sure of the teacher's decisions the pupil becomes: some of them it still tries otherwise."""
 
 
-def imitate(model: PPO, layout: Layout, share: float,
+def imitate(model: PPO, layout: Layout, teacher: Teacher,
             before_each: Callable[[], None] = lambda: None) -> None:
-    """Teach the actor to keep where less than a share of the tracks is left, the critic its worth.
+    """Teach the actor to decide as the teacher does, and the critic what that is worth.
 
     `layout` is that of the model's observation; the caller has a say `before_each` of STEPS
     decisions in every environment.
     """
-    column = sum(size for _, size in layout[:[name for name, _ in layout].index(SURVIVAL)])
     environment, policy = model.get_vec_normalize_env(), model.policy
     assert isinstance(environment, VecNormalize) and isinstance(policy, PrivilegedCritic)
-    seen, kept, returns = _watch(environment, column, share, model.gamma, before_each)
+    seen, kept, returns = _watch(environment, layout, teacher, model.gamma, before_each)
     optimiser = torch.optim.Adam(policy.parameters(), LEARNING_RATE)
     dice = torch.Generator().manual_seed(model.seed or 0)
     for _ in range(PASSES):
@@ -54,7 +52,7 @@ def imitate(model: PPO, layout: Layout, share: float,
             optimiser.step()
 
 
-def _watch(environment: VecNormalize, column: int, share: float, gamma: float,
+def _watch(environment: VecNormalize, layout: Layout, teacher: Teacher, gamma: float,
            before_each: Callable[[], None]) -> tuple[dict[str, Tensor], Tensor, Tensor]:
     """Return what the teacher saw, standardised, did, and earned from then on, discounted."""
     environment.reset()
@@ -65,7 +63,7 @@ def _watch(environment: VecNormalize, column: int, share: float, gamma: float,
         told = environment.get_original_obs()
         assert isinstance(told, dict)
         seen.append({name: values.copy() for name, values in told.items()})
-        kept.append((told[OBSERVATION][:, column] < share).astype(np.int64))
+        kept.append(teacher.decide(told[OBSERVATION], layout))
         _, _, done, _ = environment.step(kept[-1])
         rewards.append(environment.get_original_reward())
         dones.append(done)

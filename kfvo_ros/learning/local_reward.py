@@ -18,10 +18,12 @@ MOST = 3.0
 
 
 class LocalReward(Reward):
-    """The error of the last `span` frames' positions after Sim(3) alignment, on a log scale.
+    """By how much the error of the last `span` frames' positions falls, on a log scale.
 
     A window is blind to the drift of scale between windows, which is nearly all of the error of
-    a trajectory; stretches of some hundred frames see it. `alpha` is added for a keyframe.
+    a trajectory; stretches of some hundred frames see it. What is rewarded is the change: the
+    error that is there already would be in all rewards to come, and drown what a decision adds.
+    `alpha` is added for a keyframe.
     """
 
     def __init__(self, span: int, alpha: float = 0.0) -> None:
@@ -31,12 +33,16 @@ class LocalReward(Reward):
     def __call__(self, T_world_frame: np.ndarray, T_truth_frame: np.ndarray,
                  keep: bool) -> float:
         """Return the reward of a decision; without enough frames nothing is lost or won."""
-        worth = self._alpha * keep
-        if len(T_world_frame) < LEAST_SPAN:
-            return worth
-        estimated, true = T_world_frame[:, :3, 3], T_truth_frame[:, :3, 3]
-        off = geometry.umeyama(estimated, true).transform_points(estimated) - true
-        path = np.linalg.norm(np.diff(true, axis=0), axis=1).sum()
-        error = np.sqrt(np.mean(np.sum(off ** 2, axis=1)))
-        ratio = error / (ACCEPTED_SHARE * path + ACCEPTED_M)
-        return worth - float(np.clip(np.log(max(ratio, 1e-9)), -MOST, MOST))
+        before = self.standing
+        if len(T_world_frame) >= LEAST_SPAN:
+            self.standing = standing_of(T_world_frame[:, :3, 3], T_truth_frame[:, :3, 3])
+        return self.standing - before + self._alpha * keep
+
+
+def standing_of(estimated: np.ndarray, true: np.ndarray) -> float:
+    """Return how good positions (N, 3) are after Sim(3) alignment, from -MOST to MOST."""
+    off = geometry.umeyama(estimated, true).transform_points(estimated) - true
+    path = np.linalg.norm(np.diff(true, axis=0), axis=1).sum()
+    error = np.sqrt(np.mean(np.sum(off ** 2, axis=1)))
+    ratio = error / (ACCEPTED_SHARE * path + ACCEPTED_M)
+    return -float(np.clip(np.log(max(ratio, 1e-9)), -MOST, MOST))

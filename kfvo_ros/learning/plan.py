@@ -14,7 +14,6 @@ from kfvo_ros.errors import KfvoError
 from kfvo_ros.keyframes.learned import Setting
 from kfvo_ros.keyframes.rail import NO_RAIL
 from kfvo_ros.learning.archive import Archive
-from kfvo_ros.learning.imitation import SURVIVAL
 from kfvo_ros.learning.recipe import Recipe, unseen
 from kfvo_ros.learning.school import Lesson
 from kfvo_ros.options import OdometryOptions, SequenceOptions, VggtOptions
@@ -76,9 +75,10 @@ class Choices:
         present = assembly.setting_of(self.odometry, backbone)
         left_out = unseen(recipe.without, present.observation)
         seen = tuple(part for part in present.observation if part[0] not in left_out)
-        if recipe.teacher is not None and SURVIVAL not in dict(seen):
-            raise KfvoError(f'teacher: expected null where {SURVIVAL} is not observed, came '
-                            f'{recipe.teacher:g}')
+        missing = recipe.teacher.unseen_in(seen) if recipe.teacher is not None else []
+        if missing:
+            raise KfvoError('teacher: expected null where its pupil does not observe '
+                            f'{" and ".join(missing)}')
         return Plan(learned, held_out, self.seed, replace(present, observation=seen),
                     recipe)
 

@@ -14,6 +14,7 @@ from kfvo_ros.keyframes.observation import Layout
 from kfvo_ros.keyframes.rail import Rail
 from kfvo_ros.learning.augmentation import Augmentation
 from kfvo_ros.learning.strict import from_mapping, key
+from kfvo_ros.learning.teacher import Teacher
 from kfvo_ros.options import REWARDS
 from kfvo_ros.scale import SCALE_RULES
 
@@ -53,8 +54,8 @@ class LearningRate:
 class Recipe:
     """A training, after so many ``steps``: decisions in all environments together.
 
-    ``span`` is the local reward's, ``scale`` None the backbone's own rule, ``teacher`` the share
-    of a `survival` that is imitated first, None for nobody's; ``rail`` None is no rail;
+    ``span`` is the local reward's, ``scale`` None the backbone's own rule, ``teacher`` who is
+    imitated first, None for nobody; ``rail`` None is no rail;
     ``without`` names parts of the observation that the policy does not see (`unseen`).
     """
 
@@ -65,7 +66,7 @@ class Recipe:
     span: int = key(least=40, most=1000)
     alpha: float = key(least=-1.0, most=1.0)
     scale: str | None = key(choices=SCALE_RULES)
-    teacher: float | None = key(least=0.0, most=1.0)
+    teacher: Teacher | None = key(within={'flow': (0.0, 1e3), 'survival': (0.0, 1.0)})
     rail: Rail | None = key(within={'min_survival': (0.0, 1.0), 'max_gap': (1, None),
                                     'min_flow': (0.0, 1e3)})
     without: tuple[str, ...] = key()

@@ -30,10 +30,12 @@ class Reward(ABC):
     """What one decision of an episode is worth; one object serves one episode.
 
     It is told poses of the window's frames, or, where ``span`` is set, of that many input frames
-    up to the newest.
+    up to the newest. ``standing`` is how good the trajectory is so far, where the reward is by
+    how much that changes.
     """
 
     span: int | None = None
+    standing = 0.0
 
     @abstractmethod
     def __call__(self, T_world_frame: np.ndarray, T_truth_frame: np.ndarray,
