@@ -17,7 +17,8 @@ setup(
     maintainer='The kfvo_ros authors',
     maintainer_email='maintainers@kfvo-ros.example',
     packages=find_packages(include=[NAME, f'{NAME}.*']),
-    package_data={f'{NAME}.benchmarking': ['published.yaml']},
+    package_data={f'{NAME}.benchmarking': ['published.yaml'],
+                  f'{NAME}.keyframes': ['*.safetensors']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
@@ -49,7 +50,8 @@ setup(
         'train': ['stable-baselines3>=2.4', 'gymnasium>=0.29.1', 'matplotlib>=3.6', 'pillow>=9.0',
                   'tensorboard>=2.9'],
         'demo': ['matplotlib>=3.6'],
-        'test': ['colcon-common-extensions', 'evo>=1.31', 'mypy', 'pytest>=7.0', 'ruff'],
+        'test': ['colcon-common-extensions', 'evo>=1.31', 'mypy', 'pytest>=7.0',
+                 'pytest-xdist>=3.3', 'ruff'],
     },
     entry_points={
         'console_scripts': [

@@ -41,11 +41,12 @@ def make_policy(options: OdometryOptions, backbone: Backbone) -> KeyframePolicy:
         return OpticalFlow(options.flow_threshold)
     if options.keyframes == 'survival':
         return Survival(options.survival_share)
-    if options.policy is None:
-        raise KfvoError('the policy of learned keyframes is a file: expected one in policy, none '
-                        'came')
-    from kfvo_ros.keyframes.policy_file import read_policy
-    return read_policy(Path(options.policy).expanduser()).policy(setting_of(options, backbone))
+    from kfvo_ros.keyframes.policy_file import find_policy, read_policy
+    path = find_policy(options.policy, backbone.name)
+    if path is None:
+        raise KfvoError(f'no learned policy comes with the {backbone.name} backbone: expected the '
+                        'file of one in policy, none came')
+    return read_policy(path).policy(setting_of(options, backbone))
 
 
 def setting_of(options: OdometryOptions, backbone: Backbone) -> Setting:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 from kfvo_ros import __version__
 from kfvo_ros.commands import make_parser, run_command
 from kfvo_ros.errors import KfvoError, reason_of
-from kfvo_ros.keyframes import HEURISTICS, POLICIES
+from kfvo_ros.keyframes import POLICIES
 from kfvo_ros.lists import names_in, numbers_in
 from kfvo_ros.options import (
     OdometryOptions,
@@ -51,7 +51,7 @@ class BenchmarkOptions:
     """What is compared, and how."""
 
     methods: str | None = option(None, f'keyframe policies out of {",".join(POLICIES)}; default: '
-                                 'all, learned if --policy names one')
+                                 'all, learned if a policy is named or comes along')
     seeds: str = option('0', 'seeds of each method on each sequence, such as 0,1,2')
     jobs: int = option(1, 'runs side by side; they slow each other down, and the table of times '
                        'says how many there were', least=1, most=256)
@@ -84,11 +84,11 @@ def _benchmark(argv: list[str]) -> None:
 
 def _plan(arguments: argparse.Namespace, options: BenchmarkOptions) -> Plan:
     """Return what is asked for; raises KfvoError for what cannot be."""
-    from kfvo_ros.benchmarking.plan import LEARNED, Plan, fitting_policy
+    from kfvo_ros.benchmarking.plan import Plan, default_methods, fitting_policy
     from kfvo_ros.sequences.spelling import spelled_out
     odometry = from_arguments(OdometryOptions, arguments)
-    default = (*HEURISTICS, LEARNED) if odometry.policy else HEURISTICS
-    methods = names_in(options.methods, 'methods', POLICIES) if options.methods else default
+    methods = names_in(options.methods, 'methods', POLICIES) if options.methods \
+        else default_methods(odometry)
     return Plan(tuple(arguments.sequence), spelled_out(arguments.sequence), methods,
                 numbers_in(options.seeds, 'seeds'), odometry,
                 from_arguments(VggtOptions, arguments), from_arguments(SequenceOptions, arguments),

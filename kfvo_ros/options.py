@@ -47,7 +47,9 @@ class OdometryOptions:
     survival_share: float = option(
         0.8, "survival: keep when fewer of the last keyframe's tracks are left", least=0.0,
         most=1.0)
-    policy: str | None = option(None, 'learned: file of the policy (.safetensors)')
+    policy: str | None = option(
+        None, 'learned: file of the policy (.safetensors); default: the one that comes with the '
+        'backbone')
     window_size: int = option(8, 'frames in a window', least=3, most=32)
     seed: int = option(0, 'seed of every random choice', least=0)
 

@@ -186,7 +186,7 @@ def test_another_policy_of_the_same_name_is_something_else(done, sequences, poli
     (['synthetic:0', '--methods', 'every,'], "came ''"),
     (['synthetic:0', '--seeds', '1,x'], "seeds: expected whole numbers from 0 with commas in "
      "between, came '1,x'"),
-    (['synthetic:0', '--methods', 'learned'], 'name one with --policy'),
+    (['synthetic:0', '--methods', 'learned', '--backbone', 'vggt'], 'name one with --policy'),
     (['synthetic:0', '--policy', 'p.safetensors', '--methods', 'every'], 'not among the methods'),
     (['synthetic:0', '--policy', '/no/policy'], 'cannot read the policy /no/policy'),
     (['synthetic:9-1'], 'synthetic:A-B'),

@@ -15,11 +15,12 @@ from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
 from kfvo_ros import assembly
+from kfvo_ros.backbones.geometric.backbone import GeometricBackbone
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.keyframes.base import DecisionInput
 from kfvo_ros.keyframes.learned import CLIP, Actor, Layer, Learned, Setting
 from kfvo_ros.keyframes.observation import indices_of, layout_of
-from kfvo_ros.keyframes.policy_file import KEY, PolicyFile, read_policy
+from kfvo_ros.keyframes.policy_file import KEY, PolicyFile, find_policy, read_policy
 from kfvo_ros.keyframes.rail import NO_RAIL, Rail
 from kfvo_ros.options import OdometryOptions, VggtOptions
 from kfvo_ros.sequences.synthetic import SyntheticSequence
@@ -178,8 +179,6 @@ def test_missing_files_and_folders_are_named(tmp_path: Path):
 def test_a_policy_runs_with_the_backbone_it_was_trained_with(tmp_path: Path):
     path = tmp_path / 'policy.safetensors'
     options = OdometryOptions(keyframes='learned', policy=str(path))
-    with pytest.raises(KfvoError, match='none came'):
-        assembly.make_odometry(replace(options, policy=None))
     setting = assembly.setting_of(options, assembly.make_backbone(options, VggtOptions()))
     kept = []
     for bias in (ALWAYS, NEVER):
@@ -191,3 +190,25 @@ def test_a_policy_runs_with_the_backbone_it_was_trained_with(tmp_path: Path):
     assert kept[0] == 40 and 7 < kept[1] < 20
     with pytest.raises(KfvoError, match='window_size'):
         assembly.make_odometry(replace(options, window_size=6))
+
+
+def test_a_policy_comes_with_the_geometric_backbone():
+    options = OdometryOptions(keyframes='learned')
+    told = read_policy(find_policy(None, 'geometric')).training
+    assert {'command', 'seed', 'steps', 'recipe', 'sequences', 'scores'} <= set(told)
+    odometry = assembly.make_odometry(options)
+    kept = sum(odometry.process(frame).is_keyframe
+               for frame in SyntheticSequence(3, 'smooth', 40))
+    assert odometry.policy.name == 'learned' and 7 < kept < 40
+    for changes, misfit in (({'window_size': 6}, 'window_size 8'),
+                            ({'scale_rule': 'translation'}, 'scale_rule depth')):
+        with pytest.raises(KfvoError, match=misfit):
+            assembly.make_odometry(replace(options, **changes))
+
+
+def test_a_backbone_without_a_policy_of_its_own_is_told_to_need_a_file():
+    class Other(GeometricBackbone):
+        name = 'other'
+
+    with pytest.raises(KfvoError, match='no learned policy comes with the other backbone'):
+        assembly.make_odometry(OdometryOptions(keyframes='learned'), Other())

@@ -20,6 +20,8 @@ from kfvo_ros.trajectory import Trajectory, read_tum
 
 NO_TRUTH = 'no ground truth'
 STEPS = ('encode', 'estimate', 'head', 'decide')
+OF_POSITIONS = ('ate_rmse_m', 'ate_se3_rmse_m', 'ate_percent', 'path_length_m')
+"""What can be said of a straight line, which knows nothing of the camera's axes."""
 
 
 class Examiner:
@@ -59,11 +61,14 @@ class Examiner:
         if subject in self._trivial:
             return []
         self._trivial.add(subject)
-        return [_row(subject, method=method, frames=len(estimate),
-                     **asdict(score(move(estimate.stamps_ns), truth.trajectory)),
-                     ground_truth_frame=truth.frame)
-                for method, move in ((CONSTANT_POSITION, metrics.constant_position),
-                                     (STRAIGHT_LINE, metrics.straight_line))]
+        rows = []
+        for method, move in ((CONSTANT_POSITION, metrics.constant_position),
+                             (STRAIGHT_LINE, metrics.straight_line)):
+            scores = asdict(score(move(estimate.stamps_ns), truth.trajectory))
+            rows.append(_row(subject, method=method, frames=len(estimate),
+                             **{name: scores[name] for name in OF_POSITIONS},
+                             ground_truth_frame=truth.frame))
+        return rows
 
 
 def _row(subject: Subject, **values: Any) -> Row:

@@ -13,7 +13,8 @@ from kfvo_ros.benchmarking.machine import machine_name
 from kfvo_ros.benchmarking.runs import Run, sum_of
 from kfvo_ros.benchmarking.subjects import Subject
 from kfvo_ros.errors import KfvoError
-from kfvo_ros.keyframes.policy_file import read_policy
+from kfvo_ros.keyframes import HEURISTICS
+from kfvo_ros.keyframes.policy_file import find_policy, read_policy
 from kfvo_ros.options import OdometryOptions, SequenceOptions, VggtOptions, to_arguments
 
 LEARNED = 'learned'
@@ -62,15 +63,24 @@ class Plan:
     @property
     def policy_name(self) -> str | None:
         """What the learned policy is, in words."""
-        if self.policy is None or self.odometry.policy is None:
+        if self.policy is None:
             return None
-        return f'{Path(self.odometry.policy).name}, SHA-256 {self.policy[:12]}...'
+        name = Path(self.odometry.policy).name if self.odometry.policy else \
+            f'the policy that comes with the {self.odometry.backbone} backbone'
+        return f'{name}, SHA-256 {self.policy[:12]}...'
 
     def _arguments(self, method: str, seed: int) -> tuple[str, ...]:
         """Return the arguments of ``run`` after the sequence."""
         odometry = replace(self.odometry, keyframes=method, seed=seed,
                            policy=self.odometry.policy if method == LEARNED else None)
         return (*to_arguments(odometry), *to_arguments(self.vggt), *to_arguments(self.reading))
+
+
+def default_methods(odometry: OdometryOptions) -> tuple[str, ...]:
+    """Return all policies that there are for this odometry; raises KfvoError."""
+    path = find_policy(odometry.policy, odometry.backbone)
+    comes = path is not None and (odometry.policy is not None or not _misfit(path, odometry))
+    return (*HEURISTICS, LEARNED) if comes else HEURISTICS
 
 
 def fitting_policy(methods: Iterable[str], odometry: OdometryOptions) -> str | None:
@@ -83,12 +93,19 @@ def fitting_policy(methods: Iterable[str], odometry: OdometryOptions) -> str | N
             raise KfvoError(f'{odometry.policy} is for the method {LEARNED}, which is not among '
                             'the methods: add it, or leave --policy out')
         return None
-    if odometry.policy is None:
-        raise KfvoError(f'the method {LEARNED} runs a policy from a file: name one with --policy, '
-                        f'or leave {LEARNED} out of --methods')
-    path = Path(odometry.policy).expanduser()
-    setting = read_policy(path).setting
-    setting.require(replace(setting, backbone=odometry.backbone,
-                            window_size=odometry.window_size,
-                            scale_rule=odometry.scale_rule or setting.scale_rule))
+    path = find_policy(odometry.policy, odometry.backbone)
+    if path is None:
+        raise KfvoError(f'no policy comes with the {odometry.backbone} backbone for the method '
+                        f'{LEARNED}: name one with --policy, or leave {LEARNED} out of --methods')
+    misfit = _misfit(path, odometry)
+    if misfit is not None:
+        raise KfvoError(misfit)
     return sum_of(path)
+
+
+def _misfit(path: Path, odometry: OdometryOptions) -> str | None:
+    """Return why the policy cannot run in this odometry, as far as options tell."""
+    setting = read_policy(path).setting
+    return setting.misfit(replace(
+        setting, backbone=odometry.backbone, window_size=odometry.window_size,
+        scale_rule=odometry.scale_rule or setting.scale_rule))

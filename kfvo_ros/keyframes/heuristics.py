@@ -62,4 +62,4 @@ class Survival(KeyframePolicy):
 
 def mean_flow(before: np.ndarray, after: np.ndarray) -> float:
     """Return the mean length of the tracks' motion [px]."""
-    return float(np.linalg.norm(after - before, axis=1).mean())
+    return float(np.hypot(*(after - before).T).mean())

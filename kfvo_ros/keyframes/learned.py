@@ -61,15 +61,22 @@ class Setting:
 
     def require(self, present: Setting) -> None:
         """Raise KfvoError naming both where the present setting is another."""
+        misfit = self.misfit(present)
+        if misfit is not None:
+            raise KfvoError(misfit)
+
+    def misfit(self, present: Setting) -> str | None:
+        """Return why the policy cannot be used in the present setting, None where it can."""
         for name in ('backbone', 'scale_rule', 'window_size'):
             mine, theirs = getattr(self, name), getattr(present, name)
             if mine != theirs:
-                raise KfvoError(f'the policy was trained with {name} {mine}, and is to run with '
-                                f'{theirs}: choose {mine}, or a policy trained with {theirs}')
+                return (f'the policy was trained with {name} {mine}, and is to run with {theirs}: '
+                        f'choose {mine}, or a policy trained with {theirs}')
         missing = [part for part in self.observation if part not in present.observation]
         if missing:
-            raise KfvoError(f'the policy sees {missing} (name, size), which the {self.backbone} '
-                            f'backbone does not give: {list(present.observation)}')
+            return (f'the policy sees {missing} (name, size), which the {self.backbone} backbone '
+                    f'does not give: {list(present.observation)}')
+        return None
 
 
 class Learned(KeyframePolicy):

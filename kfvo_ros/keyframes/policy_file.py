@@ -55,6 +55,14 @@ class PolicyFile:
             raise KfvoError(f'cannot write the policy {path}: {reason_of(error)}') from error
 
 
+def find_policy(named: str | None, backbone: str) -> Path | None:
+    """Return the file named, else that of the policy that comes with the backbone, if any."""
+    if named is not None:
+        return Path(named).expanduser()
+    coming_along = Path(__file__).with_name(f'{backbone}.safetensors')
+    return coming_along if coming_along.exists() else None
+
+
 def read_policy(path: Path) -> PolicyFile:
     """Read a file; raises KfvoError for one that is no policy, or is not sound."""
     try:
