@@ -42,7 +42,7 @@ MARKS := mav0 rgb.txt times.txt pose_left.txt
 FOUND = $(foreach mark,$(MARKS),$(foreach depth,* */* */*/* */*/*/*,\
 	$(wildcard $(KFVO_DATA)/$(depth)/$(mark))))
 SEQUENCES ?= $(patsubst $(KFVO_DATA)/%/,%,$(sort $(dir $(FOUND)))) \
-	synthetic:0-4:smooth synthetic:0-4:fast
+	synthetic:0-2:smooth synthetic:0-2:fast
 POLICY ?=
 OPTIONS ?= --seeds 0,1,2
 
@@ -80,7 +80,8 @@ results: $(TOOLS)
 test: $(TOOLS)
 	$(VENV)/bin/ruff check .
 	[ ! -d '$(KFVO_DATA)' ] || export KFVO_DATA="$$(cd '$(KFVO_DATA)' && pwd)"; \
-	PYTEST_DISABLE_PLUGIN_AUTOLOAD=1 $(VENV)/bin/python -m pytest -rs
+	PYTEST_DISABLE_PLUGIN_AUTOLOAD=1 $(VENV)/bin/python -m pytest -rs \
+		-p xdist -n 2 --dist loadgroup
 
 lint: $(TOOLS)
 	$(VENV)/bin/ruff check .

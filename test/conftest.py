@@ -14,6 +14,17 @@ import pytest
 from kfvo_ros.interruption import SIGNALS
 from kfvo_ros.threads import single_threaded
 
+OVER_DDS = ('test_demo', 'test_node', 'test_play', 'test_vggt_node')
+"""Files whose processes talk to each other, and are timed: one after the other."""
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Tell pytest-xdist what stays together: the tests of a file, and all that talk over DDS."""
+    for item in items:
+        name = item.path.stem
+        item.add_marker(pytest.mark.xdist_group('dds' if name.startswith(OVER_DDS) else name))
+
 
 @pytest.fixture(scope='session', autouse=True)
 def one_thread() -> Iterator[None]:
