@@ -193,7 +193,7 @@ def test_what_is_missing_is_named(missing, capsys):
 
 def test_rows_differ_from_full_in_one_thing():
     recipe = read_recipe('train.yaml')
-    rows = {name: row_recipe(name, recipe, 100_000) for name in ROWS}
+    rows = {name: row_recipe(name, recipe, 80_000) for name in ROWS}
     full = vars(rows['full'])
     assert (full['reward'], full['alpha'], full['without']) == ('paper', ALPHA, ('signals',))
     changed = {name: {key: value for key, value in vars(rows[name]).items() if value != full[key]}
@@ -202,7 +202,7 @@ def test_rows_differ_from_full_in_one_thing():
     assert changed['without_descriptor'] == {'without': ('descriptor', 'signals')}
     assert changed['without_alpha'] == {'alpha': 0.0}
     assert changed['alpha_penalty'] == {'alpha': -2.5e-5}
-    assert rows['local'] == row_recipe('local', recipe, 100_000)
+    assert rows['local'] == row_recipe('local', recipe, 80_000)
     assert {key for key, value in vars(rows['local']).items() if value != vars(recipe)[key]} \
         == {'steps', 'validation_every', 'without'}
     assert {key for key in full if vars(rows['local_signals_only'])[key]
