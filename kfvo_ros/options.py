@@ -162,12 +162,12 @@ def from_arguments(options: type[Options], arguments: argparse.Namespace) -> Opt
                       for name, value in values.items() if value is not None})
 
 
-def to_arguments(options: Any, without: tuple[str, ...] = ()) -> list[str]:
-    """Return the command line that gives these options, `without` some; defaults stay unsaid."""
+def to_arguments(options: Any) -> list[str]:
+    """Return the command line that gives these options; defaults stay unsaid."""
     arguments = []
     for declared in fields(options):
         value = getattr(options, declared.name)
-        if declared.name in without or value == declared.default:
+        if value == declared.default:
             continue
         if value is True:
             arguments.append(_flag(declared))

@@ -12,11 +12,13 @@ import pytest
 from sequence_writers import write_dataset
 
 from kfvo_ros.benchmarking.machine import machine_name
+from kfvo_ros.benchmarking.plan import default_methods
 from kfvo_ros.benchmarking.rows import COLUMNS, Row, append_rows, in_order, write_rows
 from kfvo_ros.benchmarking.subjects import Subject, open_subjects
 from kfvo_ros.errors import KfvoError
+from kfvo_ros.keyframes import HEURISTICS, POLICIES
 from kfvo_ros.lists import names_in, numbers_in
-from kfvo_ros.options import SequenceOptions
+from kfvo_ros.options import OdometryOptions, SequenceOptions
 
 
 def called(path: Path, name: str) -> tuple[str, str, str]:
@@ -105,3 +107,11 @@ def test_lists():
     for text in ('', '1,', '1.5', '-1', '²', '0'):
         with pytest.raises(KfvoError, match='workers: expected whole numbers from 1'):
             numbers_in(text, 'workers', 1)
+
+
+def test_the_policy_that_comes_along_is_compared_where_it_fits():
+    assert default_methods(OdometryOptions()) == POLICIES
+    for options in (OdometryOptions(window_size=6), OdometryOptions(scale_rule='none'),
+                    OdometryOptions(backbone='vggt')):
+        assert default_methods(options) == HEURISTICS
+    assert default_methods(OdometryOptions(window_size=6, policy='mine.safetensors')) == POLICIES
