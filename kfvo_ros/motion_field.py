@@ -29,13 +29,6 @@ class MotionField:
         """Return the motion (N, 2) of pixels (N, 2)."""
         return _monomials(pixels, self.size) @ self.coefficients
 
-    @property
-    def mean(self) -> np.ndarray:
-        """The mean motion (2,) of the whole image."""
-        aspect = self.size[1] / self.size[0]
-        means = np.array([1.0, 0.0, 0.0, 1.0 / 12.0, 0.0, aspect ** 2 / 12.0])
-        return means @ self.coefficients
-
 
 def fit(pixels: np.ndarray, motion: np.ndarray, size: np.ndarray) -> MotionField | None:
     """Return the field nearest to the `motion` (N, 2) of `pixels` (N, 2), None for too few."""

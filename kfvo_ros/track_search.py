@@ -24,6 +24,8 @@ MOST = 0.7
 """When a smaller share is found from a right guess, those found tell where the others are."""
 SHRINKING = 4
 """The whole image is compared in this fraction of its size, where details do not matter."""
+INNER = np.array([[0.15, 0.15], [0.85, 0.15], [0.15, 0.85], [0.85, 0.85]])
+"""Places in an image, in shares of its size, where tracks tell how it moves."""
 
 
 def find_again(last: np.ndarray, image: np.ndarray, points: np.ndarray,
@@ -47,22 +49,30 @@ def find_again(last: np.ndarray, image: np.ndarray, points: np.ndarray,
 def _guesses(last: np.ndarray, image: np.ndarray, points: np.ndarray,
              field: MotionField | None) -> Iterator[np.ndarray | None]:
     """Generate where to start, the likeliest first; None is at the points, reaching farther."""
-    shift = whole_shift(last, image)
-    if field is None:
-        yield points + shift
-    else:
-        yield points + field.at(points) + shift - field.mean
-        yield points + field.at(points)
+    expected = points if field is None else points + field.at(points)
+    yield expected + whole_shift(last, image, field)
+    if field is not None:
+        yield expected
     yield None
 
 
-def whole_shift(last: np.ndarray, image: np.ndarray) -> np.ndarray:
-    """Return by how much (2,) [px] the whole image moved: the peak of the phase correlation."""
-    size = tuple(max(side // SHRINKING, 2) for side in image.shape[::-1])
-    small = [cv2.resize(each, size, interpolation=cv2.INTER_AREA).astype(np.float32)
-             for each in (last, image)]
-    shift, _ = cv2.phaseCorrelate(*small, cv2.createHanningWindow(size, cv2.CV_32F))
-    return np.array(shift) * image.shape[::-1] / size
+def whole_shift(last: np.ndarray, image: np.ndarray, field: MotionField | None) -> np.ndarray:
+    """Return by how much (2,) [px] the whole image moved, or by how much more than a `field`.
+
+    It is the peak of the phase correlation.
+    """
+    # Of whole blocks of pixels: others take OpenCV many times as long.
+    size = np.maximum(np.array(image.shape[::-1]) // SHRINKING, 2)
+    width, height = SHRINKING * size
+    before, after = (cv2.resize(each[:height, :width], size, interpolation=cv2.INTER_AREA)
+                     .astype(np.float32) for each in (last, image))
+    if field is not None:
+        places = INNER * field.size
+        H = cv2.getPerspectiveTransform(*((each / SHRINKING).astype(np.float32)
+                                          for each in (places, places + field.at(places))))
+        before = cv2.warpPerspective(before, H, size, borderMode=cv2.BORDER_REPLICATE)
+    shift, _ = cv2.phaseCorrelate(before, after, cv2.createHanningWindow(size, cv2.CV_32F))
+    return SHRINKING * np.array(shift)
 
 
 def _find_rest(last: np.ndarray, image: np.ndarray, points: np.ndarray, after: np.ndarray,

@@ -15,6 +15,7 @@ from kfvo_ros.backbones.geometric.observations import tabulate
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.keyframes.heuristics import Survival
 from kfvo_ros.odometry import KeyframeOdometry
+from kfvo_ros.sequences.synthetic import SyntheticSequence
 from kfvo_ros.tracking import Tracks
 
 
@@ -126,6 +127,16 @@ def test_half_a_pixel_of_noise_stays_small():
     turned = geometry.rotation_angle(np.swapaxes(truth[:, :3, :3], 1, 2) @ found[:, :3, :3])
     assert np.degrees(turned).max() < 0.3
     assert np.linalg.norm(scale * found[:, :3, 3] - truth[:, :3, 3], axis=1).max() < 0.03
+
+
+def test_a_start_before_a_wall_ends_at_the_right_one_of_two_motions():
+    """The first frames fit both; a start at the wrong one is left when later frames tell."""
+    room = SyntheticSequence(77, 'mixed', 20)
+    poses = room.ground_truth().trajectory.poses
+    ended = run(room).poses
+    wrong = geometry.relative(geometry.relative(ended[8], ended[18]),
+                              geometry.relative(poses[8], poses[18]))
+    assert np.degrees(geometry.rotation_angle(wrong[:3, :3])) < 0.5
 
 
 def test_hint_keeps_the_unit_of_the_trajectory():

@@ -11,7 +11,6 @@ import pytest
 
 from kfvo_ros import geometry, run, track_search
 from kfvo_ros.errors import KfvoError
-from kfvo_ros.motion_field import MotionField
 from kfvo_ros.sequences.synthetic import SyntheticSequence, parse_synthetic
 from kfvo_ros.tracking import Tracker, common
 
@@ -117,8 +116,7 @@ def test_mixed_seeds_defeat_who_expects_the_last_motion(tmp_path, monkeypatch):
     They do where points are searched for by the motion of the last frame alone; the shift of the
     whole image, which `find_again` starts from, saves them.
     """
-    monkeypatch.setattr(track_search, 'whole_shift', lambda last, image: np.zeros(2))
-    monkeypatch.setattr(MotionField, 'mean', np.zeros(2))
+    monkeypatch.setattr(track_search, 'whole_shift', lambda last, image, field: np.zeros(2))
     monkeypatch.setattr(track_search, 'MOST', 0.0)
     failed = 0
     for seed in (5, 9):

@@ -104,7 +104,8 @@ def _estimate(window: Window, stream: GeometricStream) -> Estimate:
     return Estimate(poses[solution.anchor:], solution.covariance(), solution.points,
                     signals(solution, motion),
                     Status.HELD if motion.window_parallax < HELD_PARALLAX else Status.OK,
-                    Memory(history.views + views, poses, solution.certain))
+                    Memory(history.views + views, poses, solution.measured,
+                           1 if previous is None else previous.memory.windows + 1))
 
 
 def _describe(grey: np.ndarray) -> np.ndarray:

@@ -33,7 +33,9 @@ MAX_SPREAD = 0.7
 LEAST_INVERSE_DEPTH = 1e-4
 
 RELATIVE_POSE = {'max_epipolar_error': 1.0, 'max_iterations': 500, 'min_iterations': 50}
-ABSOLUTE_POSE = {'max_reproj_error': 3.0, 'max_iterations': 200, 'min_iterations': 20}
+ABSOLUTE_POSE = {'max_reproj_error': 3.0, 'max_iterations': 200, 'min_iterations': 5}
+REFINEMENT = {'max_iterations': 5}
+"""Of a pose that is adjusted with the whole window next."""
 
 
 @dataclass(frozen=True)
@@ -190,7 +192,7 @@ class Initialiser:
                                   inverse_depths[rows])
         pose, info = poselib.estimate_absolute_pose(
             self.focal * observations.seen[rows, frame], positions, self._camera,
-            ABSOLUTE_POSE | {'seed': self._seed}, {})
+            ABSOLUTE_POSE | {'seed': self._seed}, REFINEMENT)
         if info['num_inliers'] < MIN_RESECTION_POINTS:
             return fallback
         return _inverse_of(pose)

@@ -20,18 +20,26 @@ scale. They are final and cost no unknowns.
 """
 MAX_SHARED = 0.8
 """A keyframe joins the history when it shares fewer tracks with the one before it there."""
+MIN_WINDOWS = 6
+"""Before a plane, two motions explain two frames; so many windows from the start on tell which."""
 
 
 @dataclass(frozen=True)
 class Memory:
     """The views of a window and its history at ``T_anchor_view``.
 
-    ``certain`` says that depths were measured well enough to hold later windows to them.
+    ``measured`` says that depths were measured well, ``windows`` how many there were in a row.
     """
 
     views: tuple[View, ...] = ()
     T_anchor_view: np.ndarray = field(default_factory=lambda: np.zeros((0, 4, 4)))
-    certain: bool = False
+    measured: bool = False
+    windows: int = 0
+
+    @property
+    def certain(self) -> bool:
+        """Whether later windows should be held to this one."""
+        return self.measured and self.windows >= MIN_WINDOWS
 
 
 @dataclass(frozen=True)

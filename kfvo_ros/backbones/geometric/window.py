@@ -66,7 +66,7 @@ class Solution:
         return poses
 
     @property
-    def certain(self) -> bool:
+    def measured(self) -> bool:
         """Whether depths are measured well enough to be held on to."""
         return self.median_information > MIN_INFORMATION
 
