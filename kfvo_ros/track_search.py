@@ -23,37 +23,62 @@ ENOUGH = 0.4
 MOST = 0.7
 """When a smaller share is found from a right guess, those found tell where the others are."""
 SHRINKING = 4
-"""The whole image is compared in this fraction of its size, where details do not matter."""
-INNER = np.array([[0.15, 0.15], [0.85, 0.15], [0.15, 0.85], [0.85, 0.85]])
-"""Places in an image, in shares of its size, where tracks tell how it moves."""
+"""The whole image is compared in this fraction of its size, where details do not matter ..."""
+LEAST_SHIFT = 4.0
+"""... and to no better than this [px]."""
+INNER = np.array([[0.3, 0.3], [0.7, 0.3], [0.3, 0.7], [0.7, 0.7]])
+"""Places in an image, in shares of its size, that stand for what its comparison weighs most."""
 
 
-def find_again(last: np.ndarray, image: np.ndarray, points: np.ndarray,
-               field: MotionField | None) -> tuple[np.ndarray, np.ndarray]:
-    """Return where points (N, 2) of `last` are in `image`, and a mask (N,) of those found.
+class TrackSearch:
+    """Finds the points of one camera's last image in the next; `field` is how that one moved.
 
-    Images are (H, W) uint8 of one size; `field` is how the last image moved, None if unknown.
+    Near and far move differently, and the image as a whole moves as neither: by how much its
+    shift was off the last time it will be again.
     """
-    after, found = points.copy(), np.zeros(len(points), dtype=bool)
-    for start in _guesses(last, image, points, field):
-        candidates = optical_flow.follow(last, image, points, start)
-        if candidates[1].sum() > found.sum():
-            after, found = candidates
-        if found.mean() >= ENOUGH:
-            break
-    if ENOUGH <= found.mean() < MOST:
-        _find_rest(last, image, points, after, found)
-    return after, found
 
+    def __init__(self, field: MotionField | None = None) -> None:
+        self._field = field
+        self._shift = np.zeros(2)
+        self._bias = np.zeros(2)
 
-def _guesses(last: np.ndarray, image: np.ndarray, points: np.ndarray,
-             field: MotionField | None) -> Iterator[np.ndarray | None]:
-    """Generate where to start, the likeliest first; None is at the points, reaching farther."""
-    expected = points if field is None else points + field.at(points)
-    yield expected + whole_shift(last, image, field)
-    if field is not None:
-        yield expected
-    yield None
+    def find_again(self, last: np.ndarray, image: np.ndarray,
+                   points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return where points (N, 2) of `last` are in `image`, and a mask (N,) of those found.
+
+        Images are (H, W) uint8 of one size.
+        """
+        after, found = points.copy(), np.zeros(len(points), dtype=bool)
+        for start in self._guesses(last, image, points):
+            candidates = optical_flow.follow(last, image, points, start)
+            if candidates[1].sum() > found.sum():
+                after, found = candidates
+            if found.mean() >= ENOUGH:
+                break
+        if ENOUGH <= found.mean() < MOST:
+            _find_rest(last, image, points, after, found)
+        return after, found
+
+    def learn(self, before: np.ndarray, after: np.ndarray, size: np.ndarray) -> None:
+        """Take in how tracks, (N, 2) each, moved between images of this width and height (2,)."""
+        field, self._field = self._field, motion_field.fit(before, after - before, size)
+        self._bias = np.zeros(2)
+        if field is not None and self._field is not None:
+            change = self._field.at(INNER * size) - field.at(INNER * size)
+            self._bias = self._shift - change.mean(axis=0)
+
+    def _guesses(self, last: np.ndarray, image: np.ndarray,
+                 points: np.ndarray) -> Iterator[np.ndarray | None]:
+        """Generate where to start, likeliest first; None is at the points and reaches farther."""
+        self._shift = whole_shift(last, image, self._field)
+        if self._field is None:
+            yield points + self._shift
+        else:
+            expected, shift = points + self._field.at(points), self._shift - self._bias
+            if np.linalg.norm(shift) > LEAST_SHIFT:
+                yield expected + shift
+            yield expected
+        yield None
 
 
 def whole_shift(last: np.ndarray, image: np.ndarray, field: MotionField | None) -> np.ndarray:

@@ -13,12 +13,10 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from kfvo_ros import motion_field
 from kfvo_ros.camera import Camera
 from kfvo_ros.corners import find_corners
-from kfvo_ros.motion_field import MotionField
 from kfvo_ros.track_ids import shared
-from kfvo_ros.track_search import find_again
+from kfvo_ros.track_search import TrackSearch
 
 FEATURES = 400
 CLAHE_CLIP, CLAHE_TILES = 3.0, (8, 8)
@@ -72,7 +70,7 @@ class Tracker:
         self._equaliser = cv2.createCLAHE(CLAHE_CLIP, CLAHE_TILES)
         self._image: np.ndarray | None = None
         self._tracks = Tracks()
-        self._field: MotionField | None = None
+        self._search = TrackSearch()
         self._next_id = 0
         self._blinks = 0
 
@@ -95,15 +93,15 @@ class Tracker:
 
     def _follow(self, last: np.ndarray | None, image: np.ndarray) -> Tracks:
         """Track the last image's corners into `image` and drop those that do not agree."""
-        field, self._field = self._field, None
         if last is None or len(self._tracks) == 0 or image.shape != last.shape:
+            self._search = TrackSearch()
             return Tracks()
         size = np.array(image.shape[::-1])
         before = self._tracks.pixels
-        after, found = find_again(last, image, before, field)
+        after, found = self._search.find_again(last, image, before)
         found &= ((after >= RIM) & (after < size - RIM)).all(axis=1)
         found[found] = self._agreeing(before[found], after[found])
-        self._field = motion_field.fit(before[found], (after - before)[found], size)
+        self._search.learn(before[found], after[found], size)
         return Tracks(self._tracks.ids[found], after[found])
 
     def _agreeing(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:

@@ -114,7 +114,7 @@ def test_mixed_seeds_defeat_who_expects_the_last_motion(tmp_path, monkeypatch):
     """An easy renderer would prove nothing: keyframes every 50 px lose over 3 % of the path.
 
     They do where points are searched for by the motion of the last frame alone; the shift of the
-    whole image, which `find_again` starts from, saves them.
+    whole image, which the search starts from, saves them.
     """
     monkeypatch.setattr(track_search, 'whole_shift', lambda last, image, field: np.zeros(2))
     monkeypatch.setattr(track_search, 'MOST', 0.0)

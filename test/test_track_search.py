@@ -13,7 +13,7 @@ import pytest
 from kfvo_ros import geometry, motion_field
 from kfvo_ros.camera import Camera
 from kfvo_ros.sequences.synthetic import SyntheticSequence
-from kfvo_ros.track_search import find_again, whole_shift
+from kfvo_ros.track_search import TrackSearch, whole_shift
 from kfvo_ros.tracking import Tracker, common
 
 HEIGHT, WIDTH = 240, 320
@@ -50,7 +50,7 @@ def test_a_turn_that_begins_or_reverses_is_followed(scene, field):
     last, image = cut(scene, 140, 90), cut(scene, 50, 90)
     points = corners(last)
     stay = points[:, 0] + 90.0 < WIDTH - 20.0
-    after, found = find_again(last, image, points, field)
+    after, found = TrackSearch(field).find_again(last, image, points)
     assert found[stay].mean() > 0.9
     assert np.abs(after - points - (90.0, 0.0))[found & stay].max() < 0.5
 
@@ -71,7 +71,7 @@ def test_a_repeated_texture_is_not_mistaken_for_its_twin():
     last, image = wall[:, 100:420].copy(), wall[:, 60:380].copy()
     points = corners(last)
     points = points[(points[:, 0] < 260.0)]
-    after, found = find_again(last, image, points, moved(0, 0))
+    after, found = TrackSearch(moved(0, 0)).find_again(last, image, points)
     right = np.abs(after - points - (40.0, 0.0)).max(axis=1) < 0.5
     assert found.mean() > 0.8 and right[found].mean() > 0.95
 
@@ -106,6 +106,6 @@ def test_a_fast_turn_in_a_room_leaves_half_of_the_tracks():
 
 def test_images_without_content_give_no_tracks_and_no_error():
     flat = np.full((HEIGHT, WIDTH), 90, dtype=np.uint8)
-    _, found = find_again(flat, flat, np.array([[50.0, 60.0]]), None)
+    _, found = TrackSearch().find_again(flat, flat, np.array([[50.0, 60.0]]))
     assert found.shape == (1,)
     assert np.isfinite(whole_shift(flat, flat, None)).all()
