@@ -121,6 +121,7 @@ def _go_through(plan: Plan, runs: Sequence[Run], finished: Sequence[Run],
     write_rows(path, rows)
     with tqdm(total=len(runs), initial=len(finished), unit='run') as bar:
         def ended(run: Run, problem: str | None) -> None:
+            """Take in what came of a run, at once."""
             new = examiner.rows(run, problem)
             append_rows(path, new)
             rows.extend(new)

@@ -193,6 +193,7 @@ def _parser_of(options: type[Any], name: str, meta: Any) -> Any:
     kind = type_of(options, name)
 
     def parse(text: str) -> Any:
+        """Return the value of a text; raises what argparse reports."""
         try:
             value = kind(text)
         except ValueError as error:

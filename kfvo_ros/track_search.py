@@ -60,7 +60,7 @@ class TrackSearch:
         return after, found
 
     def learn(self, before: np.ndarray, after: np.ndarray, size: np.ndarray) -> None:
-        """Take in how tracks, (N, 2) each, moved between images of this width and height (2,)."""
+        """Take in how tracks (N, 2) moved in the images searched last, of this size (2,) [px]."""
         field, self._field = self._field, motion_field.fit(before, after - before, size)
         self._bias = np.zeros(2)
         if field is not None and self._field is not None:

@@ -157,6 +157,7 @@ def measure(lesson: Lesson, recipe: Recipe, workers: int, seconds: float) -> Spe
         rollout = recipe.environments * recipe.ppo.n_steps
 
         def learn(end: float) -> int:
+            """Learn until then, to the end of a rollout; return how many decisions."""
             while time.perf_counter() < end:
                 model.learn(rollout, reset_num_timesteps=False)
             return model.num_timesteps

@@ -42,6 +42,7 @@ def read_curve(row: str, reward: str, folder: Path) -> Curve:
     logs = EventAccumulator(str(folder)).Reload()
 
     def values(name: str) -> np.ndarray:
+        """Return (N, 2): steps, and what was logged there last."""
         events = logs.Scalars(name) if name in logs.Tags()['scalars'] else []
         return np.array(sorted({each.step: each.value for each in events}.items())).reshape(-1, 2)
 

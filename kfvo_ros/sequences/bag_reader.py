@@ -178,6 +178,7 @@ def _layout(definitions: Any, kind: str) -> str | None:
     from rosbags.interfaces import Nodetype
 
     def describe(field: Any) -> str:
+        """Return the type of a field, as a message definition spells it."""
         node, content = field
         if node == Nodetype.BASE:
             return 'uint8' if content[0] == 'char' else content[0]

@@ -134,9 +134,11 @@ def _timed(spent: dict[str, float], part: str, module: nn.Module,
            device: torch.device) -> Iterator[None]:
     """Add to ``spent[part]`` what a module takes, or each module of a list."""
     def begin(*_: object) -> None:
+        """Start the clock."""
         spent[part] -= _now(device)
 
     def end(*_: object) -> None:
+        """Stop it."""
         spent[part] += _now(device)
 
     modules = module if isinstance(module, nn.ModuleList) else [module]
