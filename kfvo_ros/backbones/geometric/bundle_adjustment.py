@@ -23,8 +23,8 @@ import numpy as np
 from kfvo_ros.backbones.geometric.compilation import compiled
 from kfvo_ros.backbones.geometric.problem import NormalEquations, Problem, State
 
-TYPICAL_ERROR = 0.35
-"""A reprojection error of so much weighs one, whatever the width of the loss [px]."""
+HUBER = 0.8
+"""Reprojection errors beyond it count linearly [px]."""
 MIN_DEPTH = 1e-3
 """A point nearer than this share of its host depth, or behind, has no residual ..."""
 BEHIND_ERROR = 100.0
@@ -86,15 +86,14 @@ def reprojection_errors(problem: Problem, state: State) -> np.ndarray:
 
 @compiled
 def cost(problem: Problem, state: State) -> float:
-    """Return the cost [px^2] of observations, by Cauchy's loss, and of priors, by squares."""
-    errors, reach = reprojection_errors(problem, state), problem.width ** 2
+    """Return the Huber cost [px^2] of observations and priors."""
+    errors = reprojection_errors(problem, state)
     total = 0.0
     for k in range(len(errors)):
-        product = 1.0  # Its logarithm is the sum of logarithms.
         for error in errors[k]:
-            product *= 1.0 + error * error / reach
+            quadratic = min(error, HUBER)
+            total += quadratic * (2.0 * error - quadratic)
         away = state.inverse_depths[k] - problem.prior_values[k]
-        total += (reach + TYPICAL_ERROR ** 2) * math.log(product)
         total += problem.prior_weights[k] * away * away
     return total
 
@@ -163,7 +162,7 @@ def _gather(products: np.ndarray, H_cc: np.ndarray, g_c: np.ndarray) -> None:
 def linearise(problem: Problem, state: State) -> NormalEquations:
     """Return the normal equations at `state`, priors included."""
     (points, frames), fixed, focal = problem.mask.shape, problem.fixed, problem.focal
-    free, reach = frames - fixed, problem.width ** 2
+    free = frames - fixed
     H_cp, H_pp, g_p = np.zeros((6 * free, points)), np.zeros(points), np.zeros(points)
     J, products = np.zeros((2, 10)), np.zeros((free + 1, free, 10, 10))
     turns, shifts = _between(state)
@@ -180,7 +179,8 @@ def linearise(problem: Problem, state: State) -> NormalEquations:
                 continue
             u, v = p[0] / p[2], p[1] / p[2]
             e0, e1 = focal * (u - problem.seen[k, j, 0]), focal * (v - problem.seen[k, j, 1])
-            weight = (reach + TYPICAL_ERROR ** 2) / (reach + e0 * e0 + e1 * e1)
+            error = math.sqrt(e0 * e0 + e1 * e1)
+            weight = 1.0 if error < HUBER else HUBER / error
             d0 = focal * (shift[0] - shift[2] * u) / p[2]
             d1 = focal * (shift[1] - shift[2] * v) / p[2]
             H_pp[k] += weight * (d0 * d0 + d1 * d1)

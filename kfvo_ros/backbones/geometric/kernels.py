@@ -226,7 +226,7 @@ def load() -> None:
     median_shifts(seen, mask, 0, correlate(seen, mask, 0))
     medians_of_nearest(seen[:, 0].copy(), seen[:, 1].copy(), ones, 1)
     median(ones)
-    problem = ba.Problem(hosts, rays, seen, mask, 1.0, 1, ones, ones, 1.0)
+    problem = ba.Problem(hosts, rays, seen, mask, 1.0, 1, ones, ones)
     state = ba.adjust(problem, ba.State(rotations, translations, ones), 1)
     ba.reprojection_errors(problem, state)
     ba.cost(problem, state)

@@ -15,7 +15,6 @@ class Problem(NamedTuple):
     ``hosts`` (P,), ``rays`` (P, 3), ``seen`` (P, F, 2) under ``mask`` (P, F), normalised and
     undistorted; ``focal`` [px]. The first ``fixed`` frames are not moved. A point's inverse
     depth r is drawn to ``prior_values`` (P,) with ``prior_weights`` (P,) [px^2 per unit squared].
-    Errors well beyond ``width`` [px] are let go.
     """
 
     hosts: np.ndarray
@@ -26,7 +25,6 @@ class Problem(NamedTuple):
     fixed: int
     prior_weights: np.ndarray
     prior_values: np.ndarray
-    width: float
 
 
 class State(NamedTuple):

@@ -18,11 +18,8 @@ from kfvo_ros.backbones.geometric.memory import History
 from kfvo_ros.backbones.geometric.observations import Observations
 
 ITERATIONS, FINAL_ITERATIONS = 8, 4
-WIDE, NARROW = 1.0, 0.5
-"""Width of the loss [px]: a rough start is pulled from afar; in the end a track that slides a
-little, as along the rim of something near, should hardly pull."""
 MAX_ERROR = 2.0
-"""Tracks farther off anywhere after the first adjustment are outliers [px]."""
+"""Observations farther off after the first adjustment are outliers [px]."""
 KNOWN_DEPTH_PRIOR = 1.0
 """How strongly a point holds its last depth [px^2 for a depth wrong by 100 %].
 
@@ -46,7 +43,7 @@ LEAST_NOISE = 0.1
 class Solution:
     """A solved window; frame ``anchor`` is identity, those before it are its history.
 
-    ``inliers`` (P, F) are the observations of the tracks left, ``errors`` (P, F) theirs [px].
+    ``inliers`` (P, F) is what is left of the observations, ``errors`` (P, F) theirs [px].
     """
 
     observations: Observations
@@ -58,8 +55,8 @@ class Solution:
 
     @property
     def solved(self) -> np.ndarray:
-        """Mask (P,) of the points whose tracks are left."""
-        return self.inliers.any(axis=1)
+        """Mask (P,) of the points that at least two frames still agree on."""
+        return self.inliers.sum(axis=1) >= 2
 
     @cached_property
     def T_anchor_frame(self) -> np.ndarray:
@@ -147,18 +144,20 @@ class _Draft:
 
 
 def _draft(observations: Observations, focal: float, guess: Guess, anchor: int) -> _Draft:
-    """Adjust from a guess and tell the outliers: a track that is wrong once has slid before."""
+    """Adjust from a guess and tell the outliers."""
     problem = _problem(observations, focal, guess, anchor + 1)
     state = ba.adjust(problem, guess.state, ITERATIONS)
-    fits = (ba.reprojection_errors(problem, state) <= MAX_ERROR).all(axis=1)
-    inliers = observations.mask & fits[:, None]
+    inliers = observations.mask & (ba.reprojection_errors(problem, state) <= MAX_ERROR)
+    inliers &= (inliers.sum(axis=1) >= 2)[:, None]
     return _Draft(problem, state, inliers, ba.cost(problem, state))
 
 
 def _finish(observations: Observations, draft: _Draft, anchor: int) -> Solution:
-    """Adjust again without the outliers, narrowly."""
-    problem = draft.problem._replace(mask=draft.inliers, width=NARROW)
-    state = ba.adjust(problem, draft.state, FINAL_ITERATIONS)
+    """Adjust again without the outliers."""
+    problem, state = draft.problem, draft.state
+    if (draft.inliers != observations.mask).any():
+        problem = problem._replace(mask=draft.inliers)
+        state = ba.adjust(problem, state, FINAL_ITERATIONS)
     return Solution(observations, anchor, state, draft.inliers,
                     ba.reprojection_errors(problem, state), ba.linearise(problem, state))
 
@@ -169,7 +168,7 @@ def _problem(observations: Observations, focal: float, guess: Guess, fixed: int)
     strength = np.where(guess.known, KNOWN_DEPTH_PRIOR, NEW_DEPTH_PRIOR)
     spread = np.maximum(expected, LEAST_PRIOR_SPREAD * kernels.median(expected))
     return ba.Problem(observations.hosts, observations.rays, observations.seen, observations.mask,
-                      focal, fixed, strength / spread ** 2, expected, WIDE)
+                      focal, fixed, strength / spread ** 2, expected)
 
 
 def _inverse(system: np.ndarray) -> np.ndarray:
