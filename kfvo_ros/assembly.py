@@ -35,6 +35,9 @@ def make_backbone(options: OdometryOptions, vggt: VggtOptions | None = None) -> 
 
 def make_policy(options: OdometryOptions, backbone: Backbone) -> KeyframePolicy:
     """Return the keyframe policy that `options` name, for this backbone; raises KfvoError."""
+    if options.policy is not None and options.keyframes != 'learned':
+        raise KfvoError(f'the policy file {options.policy} is for keyframes learned, came '
+                        f'keyframes {options.keyframes}: choose learned, or leave the policy out')
     if options.keyframes == 'every':
         return Every()
     if options.keyframes == 'optical_flow':

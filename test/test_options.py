@@ -174,6 +174,11 @@ def test_odometry_is_what_the_options_say(keyframes):
         assert odometry.policy.share == 0.25
 
 
+def test_policy_file_is_not_ignored_where_nothing_learned_was_asked_for():
+    with pytest.raises(KfvoError, match='every is for keyframes learned, came keyframes survival'):
+        assembly.make_odometry(OdometryOptions(policy='every'))
+
+
 def test_scale_rule_is_the_backbones_unless_chosen():
     assert assembly.make_odometry(OdometryOptions()).scale.rule == 'depth'
 
