@@ -165,7 +165,8 @@ class KeyframeOdometry:
         if estimate is None:
             # The first frame is the world; that of a later start is where the last one was lost,
             # and as doubtful.
-            self._known = Knowledge(self._newest.T_world_camera, self._newest.covariance)
+            self._known = Knowledge(self._newest.T_world_camera, self._newest.covariance,
+                                    memory=self._known.memory)
             self._status = Status.OK if self._newest.index == 0 else Status.LOST
             self._parts = {}
             return True

@@ -11,6 +11,7 @@ from odometry_scenes import CAMERA, PointCloud, frames_of, moving_poses, run, tu
 from kfvo_ros import geometry
 from kfvo_ros.backbones.base import Estimate, Previous, Status, Window
 from kfvo_ros.backbones.geometric.backbone import GeometricBackbone
+from kfvo_ros.backbones.geometric.lens import Lens
 from kfvo_ros.backbones.geometric.observations import tabulate
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.keyframes.heuristics import Survival
@@ -253,7 +254,7 @@ def test_a_camera_is_needed():
 def test_table_lists_what_moving_frames_see():
     cloud, poses = PointCloud(0), moving_poses(4)
     views = [cloud.encode(index, pose).payload for index, pose in enumerate(poses)]
-    table = tabulate(views, 1)
+    table = tabulate(views, 1, Lens())
     assert (np.diff(table.ids) > 0).all()
     assert (table.mask.sum(axis=1) >= 2).all()
     assert table.mask[:, 2:].any(axis=1).all()

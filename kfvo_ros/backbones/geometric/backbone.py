@@ -12,11 +12,12 @@ import numpy as np
 from kfvo_ros.backbones.base import Backbone, Encoded, Estimate, Status, Stream, Window, lost
 from kfvo_ros.backbones.geometric import kernels
 from kfvo_ros.backbones.geometric.initialisation import Initialiser
-from kfvo_ros.backbones.geometric.memory import Memory, recall
+from kfvo_ros.backbones.geometric.lens import Lens
+from kfvo_ros.backbones.geometric.memory import Memory, memory_of, recall
 from kfvo_ros.backbones.geometric.observations import View, tabulate
 from kfvo_ros.backbones.geometric.rolling_shutter import RollingShutter
 from kfvo_ros.backbones.geometric.signals import SIGNAL_NAMES, measure_motion, signals
-from kfvo_ros.backbones.geometric.window import solve
+from kfvo_ros.backbones.geometric.window import Solution, solve
 from kfvo_ros.camera import Camera
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.images import to_grey
@@ -92,8 +93,9 @@ def _stream_of(window: Window) -> GeometricStream:
 def _estimate(window: Window, stream: GeometricStream) -> Estimate:
     views = tuple(encoded.payload for encoded in window.frames)
     previous = window.previous
-    history = recall(previous, views[0])
-    observations = tabulate(history.views + views, len(history.views))
+    memory = memory_of(previous)
+    history = recall(memory, 1.0 if previous is None else previous.memory_scale, views[0])
+    observations = tabulate(history.views + views, len(history.views), memory.lens)
     if observations.mask[:, -1].sum() < MIN_TRACKS:
         return lost(window, len(SIGNAL_NAMES), Memory())
     solution = solve(observations, stream.initialiser, previous, history)
@@ -104,8 +106,19 @@ def _estimate(window: Window, stream: GeometricStream) -> Estimate:
     return Estimate(poses[solution.anchor:], solution.covariance(), solution.points,
                     signals(solution, motion),
                     Status.HELD if motion.window_parallax < HELD_PARALLAX else Status.OK,
-                    Memory(history.views + views, poses, solution.measured,
-                           1 if previous is None else previous.memory.windows + 1))
+                    Memory(history.views + views, poses, solution.measured, memory.windows + 1,
+                           _lens(memory, solution, views, stream.camera)))
+
+
+def _lens(memory: Memory, solution: Solution, views: tuple[View, ...], camera: Camera) -> Lens:
+    """Ask the window of the lens, unless it holds keyframes that were asked with another one.
+
+    What a rolling shutter leaves in the tracks would be laid to the lens.
+    """
+    if not (memory.certain and solution.measured and views[0].index >= memory.lens.asked
+            and camera.readout_s == 0.0):
+        return memory.lens
+    return memory.lens.told(solution.problem, solution.state, solution.noise, views[-1].index)
 
 
 def _describe(grey: np.ndarray) -> np.ndarray:

@@ -43,12 +43,12 @@ its shift changes the residual as that of the seeing frame does, in the opposite
 
 
 @compiled
-def _between(state: State) -> tuple[np.ndarray, np.ndarray]:
-    """Return turns (F, F, 3, 3) and shifts (F, F, 3) from hosts to frames that come later."""
+def between(state: State) -> tuple[np.ndarray, np.ndarray]:
+    """Return turns (F, F, 3, 3) and shifts (F, F, 3) from hosts to themselves and later frames."""
     R, t, frames = state.rotations, state.translations, len(state.rotations)
     turns, shifts = np.zeros((frames, frames, 3, 3)), np.zeros((frames, frames, 3))
     for h in range(frames):
-        for j in range(h + 1, frames):
+        for j in range(h, frames):
             for a in range(3):
                 for b in range(3):
                     into, away = R[j, b, a], t[h, b] - t[j, b]
@@ -71,7 +71,7 @@ def _into_frame(turn: np.ndarray, shift: np.ndarray, ray: np.ndarray,
 def reprojection_errors(problem: Problem, state: State) -> np.ndarray:
     """Return errors (P, F) [px]: 0 where unseen or hosted, BEHIND_ERROR behind a camera."""
     points, frames = problem.mask.shape
-    turns, shifts = _between(state)
+    turns, shifts = between(state)
     errors = np.zeros((points, frames))
     for k in range(points):
         h, r = problem.hosts[k], state.inverse_depths[k]
@@ -165,7 +165,7 @@ def linearise(problem: Problem, state: State) -> NormalEquations:
     free = frames - fixed
     H_cp, H_pp, g_p = np.zeros((6 * free, points)), np.zeros(points), np.zeros(points)
     J, products = np.zeros((2, 10)), np.zeros((free + 1, free, 10, 10))
-    turns, shifts = _between(state)
+    turns, shifts = between(state)
     for k in range(points):
         h, ray, r = problem.hosts[k], problem.rays[k], state.inverse_depths[k]
         H_pp[k] = problem.prior_weights[k]

@@ -12,6 +12,7 @@ import math
 import numpy as np
 
 from kfvo_ros.backbones.geometric import bundle_adjustment as ba
+from kfvo_ros.backbones.geometric import lens_equations
 from kfvo_ros.backbones.geometric.compilation import compiled
 
 END = np.iinfo(np.int64).max
@@ -231,3 +232,5 @@ def load() -> None:
     ba.reprojection_errors(problem, state)
     ba.cost(problem, state)
     ba.reduce(ba.linearise(problem, state), 0.0)
+    lens_equations.marginal(problem, state)
+    lens_equations.basis(seen[:, 0].copy())

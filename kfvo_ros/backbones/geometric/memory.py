@@ -10,6 +10,7 @@ import numpy as np
 
 from kfvo_ros import geometry, track_ids
 from kfvo_ros.backbones.base import Previous
+from kfvo_ros.backbones.geometric.lens import Lens
 from kfvo_ros.backbones.geometric.observations import View
 
 HISTORY = 8
@@ -28,13 +29,15 @@ MIN_WINDOWS = 6
 class Memory:
     """The views of a window and its history at ``T_anchor_view``.
 
-    ``measured`` says that depths were measured well, ``windows`` how many there were in a row.
+    ``measured`` says that depths were measured well, ``windows`` how many there were in a row;
+    ``lens`` is what is known of the lens by then.
     """
 
     views: tuple[View, ...] = ()
     T_anchor_view: np.ndarray = field(default_factory=lambda: np.zeros((0, 4, 4)))
     measured: bool = False
     windows: int = 0
+    lens: Lens = field(default_factory=Lens)
 
     @property
     def certain(self) -> bool:
@@ -50,14 +53,21 @@ class History:
     T_anchor_view: np.ndarray = field(default_factory=lambda: np.zeros((0, 4, 4)))
 
 
-def recall(previous: Previous | None, anchor: View) -> History:
+def memory_of(previous: Previous | None) -> Memory:
+    """Return what the last window left; a start from nothing keeps no more than the lens."""
+    if previous is None or previous.memory is None:
+        return Memory()
+    return previous.memory if previous.points is not None else Memory(lens=previous.memory.lens)
+
+
+def recall(memory: Memory, scale: float, anchor: View) -> History:
     """Return the keyframes before `anchor` that the last window knew for certain.
 
     Keyframes that hardly differ from the one before them would only shorten the baselines.
+    `scale` is trajectory units per unit of the memory.
     """
-    if previous is None or not previous.memory.certain:
+    if not memory.certain:
         return History()
-    memory = previous.memory
     indices = [view.index for view in memory.views]
     if anchor.index not in indices:
         return History()
@@ -69,7 +79,7 @@ def recall(previous: Previous | None, anchor: View) -> History:
     spaced = spaced[-HISTORY:]
     T_anchor_view = geometry.relative(memory.T_anchor_view[position],
                                       memory.T_anchor_view[spaced])
-    T_anchor_view[:, :3, 3] *= previous.memory_scale
+    T_anchor_view[:, :3, 3] *= scale
     return History(tuple(memory.views[index] for index in spaced), T_anchor_view)
 
 

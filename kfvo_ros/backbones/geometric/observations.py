@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kfvo_ros.backbones.geometric import kernels
+from kfvo_ros.backbones.geometric.lens import Lens
 from kfvo_ros.tracking import Tracks
 
 
@@ -17,8 +18,8 @@ from kfvo_ros.tracking import Tracks
 class View:
     """What one frame sees: ``tracks`` in pixels, and where they lie undistorted.
 
-    ``points`` (N, 2) are normalised, undistorted coordinates of the same tracks; ``index``
-    counts the input frames of the stream.
+    ``points`` (N, 2) are normalised, undistorted coordinates of the same tracks, by the
+    calibration; ``index`` counts the input frames of the stream.
     """
 
     index: int
@@ -44,11 +45,11 @@ class Observations:
         return len(self.ids)
 
 
-def tabulate(views: Sequence[View], anchor: int) -> Observations:
+def tabulate(views: Sequence[View], anchor: int, lens: Lens) -> Observations:
     """Gather the tracks of `views`, oldest first, that a frame after the anchor sees."""
     ids, seen, mask = kernels.merge(
         np.concatenate([view.tracks.ids for view in views]),
-        np.concatenate([view.points for view in views]),
+        lens.straighten(np.concatenate([view.points for view in views])),
         np.cumsum([len(view.points) for view in views]), anchor + 1)
     hosts = mask.argmax(axis=1) if len(ids) else np.zeros(0, dtype=np.int64)
     rays = np.ones((len(ids), 3))

@@ -14,7 +14,7 @@ from kfvo_ros.backbones.base import Points, Previous
 from kfvo_ros.backbones.geometric import bundle_adjustment as ba
 from kfvo_ros.backbones.geometric import kernels
 from kfvo_ros.backbones.geometric.initialisation import Guess, Initialiser
-from kfvo_ros.backbones.geometric.memory import History
+from kfvo_ros.backbones.geometric.memory import History, memory_of
 from kfvo_ros.backbones.geometric.observations import Observations
 
 ITERATIONS, FINAL_ITERATIONS = 8, 4
@@ -43,11 +43,13 @@ LEAST_NOISE = 0.1
 class Solution:
     """A solved window; frame ``anchor`` is identity, those before it are its history.
 
-    ``inliers`` (P, F) is what is left of the observations, ``errors`` (P, F) theirs [px].
+    ``inliers`` (P, F) is what is left of the observations, as in ``problem``, and ``errors``
+    (P, F) theirs [px].
     """
 
     observations: Observations
     anchor: int
+    problem: ba.Problem
     state: ba.State
     inliers: np.ndarray
     errors: np.ndarray
@@ -76,6 +78,12 @@ class Solution:
         return kernels.median(self.points.information) if len(self.points.ids) else 0.0
 
     @cached_property
+    def noise(self) -> float:
+        """Median error of what is left of the observations, 1 without any [px]."""
+        measured = self.inliers & (self.errors > 0.0)
+        return max(LEAST_NOISE, kernels.median(self.errors[measured]) if measured.any() else 1.0)
+
+    @cached_property
     def points(self) -> Points:
         """Return the solved points; a depth's information is that given the poses."""
         rows = np.flatnonzero(self.solved)
@@ -92,12 +100,9 @@ class Solution:
         It contains how well the window's scale is tied to the past, by history and depth
         priors: where points have no parallax it grows, which reprojection errors do not show.
         """
-        measured = self.inliers & (self.errors > 0.0)
-        typical = kernels.median(self.errors[measured]) if measured.any() else 1.0
-        noise = max(LEAST_NOISE, typical)
         system, _ = ba.reduce(self.normal, 0.0)
         free = len(system) // 6
-        blocks = noise ** 2 * _inverse(system).reshape(free, 6, free, 6)
+        blocks = self.noise ** 2 * _inverse(system).reshape(free, 6, free, 6)
         turns = np.zeros((free, 6, 6))
         turns[:, :3, 3:], turns[:, 3:, :3] = np.eye(3), self.state.rotations[self.anchor + 1:]
         covariance = np.zeros((free + 1, 6, 6))
@@ -121,8 +126,7 @@ def solve(observations: Observations, initialiser: Initialiser, previous: Previo
         if drafts[0].newest_inlier_share < SUSPICIOUS_SHARE:
             guess = initialiser.from_previous(observations, previous, history, True)
             drafts.append(_draft(observations, focal, guess, anchor))
-    certain = previous is not None and previous.memory.certain
-    if not drafts or (not certain and initialiser.moved(observations)):
+    if not drafts or (not memory_of(previous).certain and initialiser.moved(observations)):
         guess = initialiser.from_nothing(observations)
         drafts.append(_draft(observations, focal, guess, anchor))
     return _finish(observations, min(drafts, key=lambda draft: draft.cost), anchor)
@@ -158,7 +162,7 @@ def _finish(observations: Observations, draft: _Draft, anchor: int) -> Solution:
     if (draft.inliers != observations.mask).any():
         problem = problem._replace(mask=draft.inliers)
         state = ba.adjust(problem, state, FINAL_ITERATIONS)
-    return Solution(observations, anchor, state, draft.inliers,
+    return Solution(observations, anchor, problem, state, draft.inliers,
                     ba.reprojection_errors(problem, state), ba.linearise(problem, state))
 
 

@@ -1,0 +1,163 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What a calibration got wrong is learnt from windows, and nothing where nothing is wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from odometry_scenes import CAMERA, PointCloud, moving_poses, run
+
+from kfvo_ros import geometry, metrics
+from kfvo_ros.backbones.base import Estimate, Points, Previous, Window
+from kfvo_ros.backbones.geometric import lens_equations
+from kfvo_ros.backbones.geometric.backbone import GeometricBackbone
+from kfvo_ros.backbones.geometric.initialisation import Initialiser
+from kfvo_ros.backbones.geometric.lens import EXPECTED, Lens
+from kfvo_ros.backbones.geometric.memory import History, Memory, memory_of
+from kfvo_ros.backbones.geometric.observations import tabulate
+from kfvo_ros.backbones.geometric.window import Solution, solve
+from kfvo_ros.camera import Camera
+from kfvo_ros.keyframes.heuristics import Survival
+from kfvo_ros.sequences.base import Frame
+from kfvo_ros.sequences.synthetic import SyntheticSequence
+
+GAZE = geometry.make_transform(geometry.exp_so3(0.08 * np.sin(np.arange(24).reshape(8, 3))),
+                               np.zeros((8, 3)))
+"""It wanders: straight ahead, an image that is too large is as good as a longer room."""
+
+
+def solved(seed: int, errors: tuple[float, float], noise: float) -> Solution:
+    """Return a window of points that are seen through a lens with `errors`."""
+    cloud = PointCloud(seed, noise=noise)
+    poses = moving_poses(8, 0.25) @ GAZE
+    poses = geometry.invert(poses[0]) @ poses
+    views = []
+    for index, pose in enumerate(poses):
+        view = cloud.encode(index, pose).payload
+        shares = lens_equations.basis(view.points)
+        views.append(replace(view, points=view.points * (1.0 + shares @ errors)[:, None]))
+    return solve(tabulate(views, 0, Lens()), Initialiser(CAMERA.fx, 0), None, History())
+
+
+@pytest.mark.parametrize('errors', [(0.006, 0.0), (0.0, -0.006), (-0.004, 0.005)])
+def test_exact_tracks_tell_the_lens(errors):
+    window = solved(1, errors, 0.0)
+    information, pull = lens_equations.marginal(window.problem, window.state)
+    assert np.allclose(np.linalg.solve(information, pull), errors, atol=4e-4)
+
+
+def test_noisy_tracks_tell_as_much_as_they_claim():
+    """A host's noise taken for truth would be laid to the lens, and claimed to be sure."""
+    noise, squares, information, pull = 0.4, [], np.zeros((2, 2)), np.zeros(2)
+    for seed in range(40):
+        window = solved(seed, (0.0, 0.0), noise)
+        one, by_one = (each / noise ** 2
+                       for each in lens_equations.marginal(window.problem, window.state))
+        squares.append(by_one @ np.linalg.solve(one, by_one))
+        information, pull = information + one, pull + by_one
+    assert pull @ np.linalg.solve(information, pull) < 12.0, 'of two, exceeded once in 400'
+    assert 1.0 < np.mean(squares) < 4.0, 'a chi square of two degrees of freedom has mean two'
+
+
+def test_each_answer_adds_to_what_is_known():
+    window = solved(3, (0.0, 0.005), 0.3)
+    first = Lens().told(window.problem, window.state, window.noise, 7)
+    second = first.told(window.problem, window.state, window.noise, 15)
+    assert 0.0 < first.errors[1] < 0.005
+    assert (first.asked, second.asked) == (7, 15)
+    variances = [np.linalg.inv(lens.information)[1, 1] for lens in (first, second)]
+    assert EXPECTED ** 2 > variances[0] > variances[1]
+
+
+def test_a_window_without_parallax_tells_nothing_of_the_focal_length():
+    cloud = PointCloud(0, noise=0.3)
+    views = [cloud.encode(index, np.eye(4)).payload for index in range(8)]
+    window = solve(tabulate(views, 0, Lens()), Initialiser(CAMERA.fx, 0), None, History())
+    lens = Lens().told(window.problem, window.state, window.noise, 7)
+    assert np.isfinite(lens.errors).all()
+    assert (np.abs(lens.errors) < EXPECTED).all()
+
+
+def test_a_lens_without_errors_changes_no_bit_and_the_rim_of_a_fisheye_stays_near():
+    points = np.random.default_rng(0).normal(size=(50, 2))
+    assert Lens().straighten(points).tobytes() == points.tobytes()
+    far = np.array([[5.6, 0.0]])
+    assert np.allclose(Lens(np.array([0.0, 0.01])).straighten(far), far, rtol=0.021)
+
+
+class Watched(GeometricBackbone):
+    """Remembers what every estimate leaves to the next."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.memories: list[Memory] = []
+
+    def estimate(self, windows: Sequence[Window]) -> list[Estimate]:
+        estimates = super().estimate(windows)
+        self.memories += [estimate.memory for estimate in estimates]
+        return estimates
+
+
+SEQUENCE = SyntheticSequence(0, 'smooth', 150)
+K1 = 0.01
+
+
+def frames(camera: Camera, black: range = range(0)) -> Iterator[Frame]:
+    for index, frame in enumerate(SEQUENCE):
+        yield replace(frame, camera=camera,
+                      image=np.zeros_like(frame.image) if index in black else frame.image)
+
+
+def calibrated(k1: float, readout_s: float = 0.0) -> Camera:
+    """Return what somebody says of the sequence's camera, which has no distortion."""
+    return replace(SEQUENCE.camera, distortion_model='plumb_bob', distortion=(k1, 0.0, 0.0, 0.0),
+                   readout_s=readout_s)
+
+
+def test_a_wrong_calibration_is_found_out():
+    errors = {}
+    for readout_s in (0.0, 1e-9):
+        backbone = Watched()
+        result = run(frames(calibrated(K1, readout_s)), Survival(), backbone)
+        errors[readout_s] = metrics.absolute_trajectory_error(
+            result.trajectory, SEQUENCE.ground_truth().trajectory).rmse
+        found = backbone.memories[-1].lens
+        if readout_s:
+            assert found.asked == -1, 'what a rolling shutter does would be laid to the lens'
+        else:
+            assert abs(found.errors[1] + K1) < 0.3 * K1
+            assert abs(found.errors[0]) < 0.005
+    assert errors[0.0] < 0.6 * errors[1e-9]
+
+
+def test_a_right_calibration_is_left_alone():
+    backbone = Watched()
+    run(frames(SEQUENCE.camera), Survival(), backbone)
+    lens = backbone.memories[-1].lens
+    assert lens.asked > 0
+    assert abs(lens.errors[1]) < 0.2 * K1
+
+
+def test_a_start_from_nothing_keeps_the_lens_and_nothing_else():
+    lens = Lens(np.array([0.001, 0.002]), asked=7)
+    memory = Memory((), np.eye(4)[None], True, 20, lens)
+    previous = Previous(np.eye(4)[None], np.eye(4), None, memory)
+    kept = memory_of(previous)
+    assert kept.lens is lens
+    assert (kept.windows, kept.certain, kept.views) == (0, False, ())
+    assert memory_of(replace(previous, points=Points(*np.zeros((3, 0))))) is memory
+    assert memory_of(None).lens.asked == -1
+
+
+def test_darkness_does_not_forget_the_lens():
+    backbone = Watched()
+    run(frames(calibrated(K1), range(100, 115)), Survival(), backbone)
+    windows = [memory.windows for memory in backbone.memories]
+    anew = next(index for index in range(1, len(windows)) if windows[index] < windows[index - 1])
+    before, after = (backbone.memories[index].lens for index in (anew - 1, anew))
+    assert before.errors[1] < -0.3 * K1
+    assert np.array_equal(before.errors, after.errors)
