@@ -13,18 +13,24 @@ import pytest
 
 from kfvo_ros import geometry
 from kfvo_ros.backbones.geometric import bundle_adjustment as ba
-from kfvo_ros.backbones.geometric import kernels
+from kfvo_ros.backbones.geometric import kernels, schur
 
-FRAMES, POINTS, FOCAL = 6, 120, 400.0
+FRAMES, POINTS, FOCAL, WIDTH = 6, 120, 400.0, 2.0
 
 
-def project(state: ba.State, hosts: np.ndarray, rays: np.ndarray) -> np.ndarray:
-    """Return where every frame sees every point (P, F, 2), by the definition."""
-    T_w_frame = geometry.make_transform(state.rotations, state.translations)
-    local = np.column_stack([(rays / state.inverse_depths[:, None]), np.ones(len(rays))])
-    world = np.einsum('pij,pj->pi', T_w_frame[hosts], local)
-    points = np.einsum('fij,pj->pfi', geometry.invert(T_w_frame), world)
-    return points[..., :2] / points[..., 2:3]
+def positions(problem: ba.Problem, state: ba.State) -> np.ndarray:
+    """Return where the points are (P, 3)."""
+    x, y, r = state.points
+    local = np.stack([x / r, y / r, 1.0 / r, np.ones(POINTS)], axis=1)
+    return np.einsum('pij,pj->pi', problem.origins[problem.hosts], local)[:, :3]
+
+
+def project(problem: ba.Problem, state: ba.State) -> np.ndarray:
+    """Return where every frame sees every point (F, 2, P), by the definition."""
+    T_frame_w = geometry.invert(geometry.make_transform(state.rotations, state.translations))
+    points = np.einsum('fij,pj->fip', T_frame_w[:, :3, :3], positions(problem, state))
+    points += T_frame_w[:, :3, 3:]
+    return points[:, :2] / points[:, 2:]
 
 
 def window(seed: int = 0, noise: float = 0.0, fixed: int = 1,
@@ -34,45 +40,58 @@ def window(seed: int = 0, noise: float = 0.0, fixed: int = 1,
     rotations = geometry.exp_so3(0.05 * rng.normal(size=(FRAMES, 3)))
     translations = 0.3 * rng.normal(size=(FRAMES, 3))
     rotations[0], translations[0] = np.eye(3), 0.0
+    origins = geometry.make_transform(
+        rotations @ geometry.exp_so3(0.02 * rng.normal(size=(FRAMES, 3))),
+        translations + 0.05 * rng.normal(size=(FRAMES, 3)))
     hosts = rng.integers(0, 3, POINTS)
-    rays = np.column_stack([rng.uniform(-0.5, 0.5, (POINTS, 2)), np.ones(POINTS)])
-    state = ba.State(rotations, translations, 1.0 / rng.uniform(2.0, 6.0, POINTS))
-    mask = rng.random((POINTS, FRAMES)) < 0.7
-    mask[np.arange(POINTS), hosts] = True
-    mask &= np.arange(FRAMES) >= hosts[:, None]
-    mask[:, -1] = True
-    seen = project(state, hosts, rays)
+    points = np.stack([*rng.uniform(-0.5, 0.5, (2, POINTS)), 1.0 / rng.uniform(2.0, 6.0, POINTS)])
+    state = ba.State(rotations, translations, points)
+    mask = rng.random((FRAMES, POINTS)) < 0.7
+    mask[hosts, np.arange(POINTS)] = True
+    mask &= np.arange(FRAMES)[:, None] >= hosts
+    mask[-1] = True
+    weights, values = np.full(POINTS, prior), points[2] * rng.uniform(0.8, 1.2, POINTS)
+    problem = ba.Problem(hosts, origins, np.zeros((FRAMES, 2, POINTS)), mask, FOCAL, fixed,
+                         weights, values, WIDTH)
+    seen = project(problem, state)
     seen += noise / FOCAL * rng.normal(size=seen.shape)
-    seen[np.arange(POINTS), hosts] = rays[:, :2]
-    weights = np.full(POINTS, prior)
-    values = state.inverse_depths * rng.uniform(0.8, 1.2, POINTS)
-    return ba.Problem(hosts, rays, seen, mask, FOCAL, fixed, weights, values), state
+    return problem._replace(seen=seen), state
 
 
 def disturbed(problem: ba.Problem, state: ba.State, size: float = 1.0) -> ba.State:
     """Return the state with all that is free some way off."""
     rng = np.random.default_rng(9)
     step = size * rng.normal(size=(FRAMES - problem.fixed, 6)) * np.repeat([0.01, 0.05], 3)
-    depths = size * 0.1 * state.inverse_depths * rng.normal(size=POINTS)
-    return ba.stepped(state, step.ravel(), depths)
+    points = size * rng.normal(size=(3, POINTS)) * [[2e-3], [2e-3], [0.1]]
+    points[2] *= state.points[2]
+    return ba.stepped(state, step.ravel(), points)
 
 
 def half_gradient(problem: ba.Problem, state: ba.State) -> np.ndarray:
-    normal = ba.linearise(problem, state)
-    return np.concatenate([normal.g_c, normal.g_p])
+    normal = ba.linearise(problem, state, False)
+    return np.concatenate([normal.g_c, normal.g_p.ravel()])
+
+
+def dense(normal: ba.NormalEquations) -> np.ndarray:
+    """Return the Hessian of all that is free: poses, then x, y and inverse depths of points."""
+    xx, yx, yy, rx, ry, rr = map(np.diag, normal.H_pp)
+    H_pp = np.block([[xx, yx, rx], [yx, yy, ry], [rx, ry, rr]])
+    H_cp = normal.H_cp.reshape(len(normal.g_c), -1)
+    return np.block([[normal.H_cc, H_cp], [H_cp.T, H_pp]])
 
 
 def moved_along(problem: ba.Problem, state: ba.State, index: int, by: float) -> ba.State:
-    """Return the state moved along one free parameter: poses first, then depths."""
+    """Return the state moved along one free parameter: poses first, then points."""
     size = 6 * (FRAMES - problem.fixed)
-    step = np.zeros(size + POINTS)
+    step = np.zeros(size + 3 * POINTS)
     step[index] = by
-    return ba.stepped(state, step[:size], step[size:])
+    return ba.stepped(state, step[:size], step[size:].reshape(3, POINTS))
 
 
-@pytest.mark.parametrize('fixed', [1, 3])
-def test_gradient_is_that_of_half_the_cost(fixed):
+@pytest.mark.parametrize(('fixed', 'width'), [(1, 2.0), (3, 2.0), (1, 0.5)])
+def test_gradient_is_that_of_half_the_cost(fixed, width):
     problem, truth = window(noise=1.0, fixed=fixed, prior=30.0)
+    problem = problem._replace(width=width)
     state = disturbed(problem, truth, 0.2)
     gradient, eps = half_gradient(problem, state), 1e-6
     numeric = np.array([
@@ -85,10 +104,9 @@ def test_gradient_is_that_of_half_the_cost(fixed):
 
 def test_hessian_is_the_derivative_of_the_gradient_where_residuals_vanish():
     problem, state = window(fixed=2, prior=30.0)
-    normal, eps = ba.linearise(problem, state), 1e-6
-    size = len(normal.g_c)
-    H = np.block([[normal.H_cc, normal.H_cp], [normal.H_cp.T, np.diag(normal.H_pp)]])
-    indices = [*range(size), *range(size, size + POINTS, 7)]
+    normal, eps = ba.linearise(problem, state, False), 1e-6
+    size, H = len(normal.g_c), dense(normal)
+    indices = [*range(size), *range(size, size + 3 * POINTS, 7)]
     numeric = np.array([
         (half_gradient(problem, moved_along(problem, state, index, eps))
          - half_gradient(problem, moved_along(problem, state, index, -eps))) / (2.0 * eps)
@@ -99,22 +117,43 @@ def test_hessian_is_the_derivative_of_the_gradient_where_residuals_vanish():
 @pytest.mark.parametrize('damping', [1e-4, 1.0])
 def test_schur_step_is_the_dense_step(damping):
     problem, truth = window(noise=1.0, prior=3.0)
-    normal = ba.linearise(problem, disturbed(problem, truth))
-    poses, depths = ba.step(normal, damping)
-    H = np.block([[normal.H_cc, normal.H_cp], [normal.H_cp.T, np.diag(normal.H_pp)]])
+    normal = ba.linearise(problem, disturbed(problem, truth), False)
+    H, gradient = dense(normal), np.concatenate([normal.g_c, normal.g_p.ravel()])
     H[np.diag_indices(len(H))] *= 1.0 + damping
-    dense = -np.linalg.solve(H, np.concatenate([normal.g_c, normal.g_p]))
-    np.testing.assert_allclose(np.concatenate([poses, depths]), dense, rtol=1e-5, atol=1e-9)
+    poses, points = schur.step(normal, damping)
+    np.testing.assert_allclose(np.concatenate([poses, points.ravel()]),
+                               -np.linalg.solve(H, gradient), rtol=1e-5, atol=1e-9)
+
+
+def test_a_reduced_system_knows_what_the_dense_one_knows_and_leaves_the_equations():
+    problem, truth = window(noise=1.0, prior=3.0)
+    normal = ba.linearise(problem, truth, False)
+    before = [part.copy() for part in normal]
+    system, gradient = schur.reduce(normal)
+    assert all(map(np.array_equal, before, normal))
+    size, H = len(gradient), dense(normal)
+    inverse = np.linalg.inv(H)
+    np.testing.assert_allclose(np.linalg.inv(system), inverse[:size, :size], rtol=1e-4)
+    np.testing.assert_allclose(np.linalg.solve(system, gradient),
+                               (inverse @ half_gradient(problem, truth))[:size], rtol=1e-4)
+
+
+def test_what_is_known_of_a_depth_leaves_its_ray_open():
+    problem, truth = window(noise=1.0, prior=3.0)
+    normal = ba.linearise(problem, truth, False)
+    variances = np.linalg.inv(dense(normal)[len(normal.g_c):, len(normal.g_c):]).diagonal()
+    np.testing.assert_allclose(schur.depth_information(normal), 1.0 / variances[2 * POINTS:],
+                               rtol=1e-5)
 
 
 def test_exact_window_is_recovered_up_to_scale():
     problem, truth = window()
     found = ba.adjust(problem, disturbed(problem, truth), 60)
     scale = np.linalg.norm(truth.translations) / np.linalg.norm(found.translations)
-    found = found.scaled(scale)
     np.testing.assert_allclose(found.rotations, truth.rotations, atol=1e-6)
-    np.testing.assert_allclose(found.translations, truth.translations, atol=1e-5)
-    np.testing.assert_allclose(found.inverse_depths, truth.inverse_depths, rtol=1e-4)
+    np.testing.assert_allclose(scale * found.translations, truth.translations, atol=1e-5)
+    np.testing.assert_allclose(scale * positions(problem, found), positions(problem, truth),
+                               atol=1e-3)
 
 
 def test_fixed_frames_hold_the_scale_and_never_move():
@@ -125,7 +164,7 @@ def test_fixed_frames_hold_the_scale_and_never_move():
     assert np.array_equal(found.translations[:3], truth.translations[:3])
     assert not np.allclose(start.translations[3:], truth.translations[3:], atol=1e-3)
     np.testing.assert_allclose(found.translations, truth.translations, atol=1e-5)
-    np.testing.assert_allclose(found.inverse_depths, truth.inverse_depths, rtol=1e-4)
+    np.testing.assert_allclose(found.points, truth.points, rtol=1e-4, atol=1e-6)
 
 
 def test_cost_never_rises_with_more_iterations():
@@ -140,7 +179,7 @@ def test_cost_never_rises_with_more_iterations():
 def test_few_wrong_tracks_do_not_pull_the_poses():
     problem, truth = window(noise=0.2, fixed=3)
     wrong = problem.seen.copy()
-    wrong[::12, -1] += 30.0 / FOCAL
+    wrong[-1, :, ::12] += 30.0 / FOCAL
     found = ba.adjust(problem._replace(seen=wrong), disturbed(problem, truth, 0.3), 30)
     errors = np.linalg.norm(found.translations - truth.translations, axis=1)
     assert errors.max() < 0.01  # the scene is 2 to 6 away
@@ -150,7 +189,7 @@ def test_prior_holds_what_nothing_measures():
     problem, truth = window(prior=1.0)
     lonely = problem._replace(mask=np.zeros_like(problem.mask))
     found = ba.adjust(lonely, truth, 20)
-    np.testing.assert_allclose(found.inverse_depths, problem.prior_values, rtol=1e-3)
+    np.testing.assert_allclose(found.points[2], problem.prior_values, rtol=1e-3)
     assert np.array_equal(found.translations, truth.translations)
 
 
@@ -158,29 +197,71 @@ def test_points_behind_a_camera_count_without_pulling():
     problem, state = window()
     turned = state.rotations.copy()
     turned[-1] = geometry.exp_so3(np.array([0.0, np.pi, 0.0]))
-    behind = ba.State(turned, state.translations, state.inverse_depths)
+    behind = ba.State(turned, state.translations, state.points)
     errors = ba.reprojection_errors(problem, behind)
-    assert (errors[:, -1] == ba.BEHIND_ERROR).all()
-    normal = ba.linearise(problem, behind)
+    assert (errors[-1] == ba.BEHIND_ERROR).all()
+    normal = ba.linearise(problem, behind, False)
     assert np.isfinite(normal.H_cc).all()
     assert not normal.g_c[-6:].any()
 
 
-def test_unseen_and_hosted_observations_have_no_error():
+def test_errors_are_those_of_what_is_seen():
     problem, state = window(noise=1.0)
     errors = ba.reprojection_errors(problem, state)
-    hosted = np.arange(FRAMES) == problem.hosts[:, None]
-    assert not errors[~problem.mask | hosted].any()
-    shift = np.linalg.norm(project(state, problem.hosts, problem.rays) - problem.seen, axis=2)
-    measured = problem.mask & ~hosted
-    np.testing.assert_allclose(errors[measured], FOCAL * shift[measured], rtol=1e-9)
+    assert not errors[~problem.mask].any()
+    shift = np.linalg.norm(project(problem, state) - problem.seen, axis=1)
+    np.testing.assert_allclose(errors[problem.mask], FOCAL * shift[problem.mask], rtol=1e-9)
+
+
+def test_a_host_is_believed_no_more_than_others():
+    """Where nothing moves, its noise taken for truth would be parallax of one sign."""
+    problem, truth = window(fixed=FRAMES - 1)
+    still = ba.State(np.tile(np.eye(3), (FRAMES, 1, 1)), np.zeros((FRAMES, 3)), truth.points)
+    problem = problem._replace(origins=np.tile(np.eye(4), (FRAMES, 1, 1)), width=100.0)
+    problem = problem._replace(hosts=np.zeros(POINTS, dtype=np.int64),
+                               mask=np.ones_like(problem.mask))
+    noise = np.random.default_rng(3).choice([-1.0, 1.0], (2, POINTS)) / FOCAL
+    seen = project(problem, still)
+    seen[0] += noise
+    found = ba.adjust(problem._replace(seen=seen), still, 20)
+    np.testing.assert_allclose(found.points[:2] - truth.points[:2], noise / FRAMES, rtol=0.15)
+
+
+def test_a_narrow_loss_lets_tracks_go_that_slide_a_little():
+    problem, truth = window(noise=0.05, fixed=3)
+    sliding = problem.seen.copy()
+    sliding[-1, :, ::3] += 1.5 / FOCAL
+    errors = []
+    for width in (2.0, 0.5):
+        found = ba.adjust(problem._replace(seen=sliding, width=width), truth, 30)
+        errors.append(np.linalg.norm(found.translations[-1] - truth.translations[-1]))
+    assert errors[1] < 0.5 * errors[0]
+
+
+def test_equations_with_the_lens_are_those_of_bent_points():
+    problem, truth = window(noise=0.3, prior=3.0)
+    normal, poses = ba.linearise(problem, truth, True), 6 * (FRAMES - 1)
+    plain = ba.linearise(problem, truth, False)
+    assert np.array_equal(normal.H_cc[:poses, :poses], plain.H_cc)
+    assert np.array_equal(normal.g_p, plain.g_p)
+    where, eps = project(problem, truth), 1e-6
+    for row, shares in enumerate([1.0, (where ** 2).sum(axis=1, keepdims=True)]):
+        # Points that lie farther off by a share are as if their tracks lay nearer by it.
+        at = [problem._replace(seen=problem.seen - sign * eps * shares * where)
+              for sign in (1.0, -1.0)]
+        slope = (ba.cost(at[0], truth) - ba.cost(at[1], truth)) / (4.0 * eps)
+        assert normal.g_c[poses + row] == pytest.approx(slope, rel=1e-5, abs=1e-3)
 
 
 def test_triangulation_is_exact_and_knows_where_there_is_no_parallax():
     problem, state = window()
-    arguments = problem.hosts, problem.rays, problem.seen, problem.mask
+    problem = problem._replace(
+        origins=geometry.make_transform(state.rotations, state.translations))
+    seen = np.ascontiguousarray(project(problem, state).transpose(2, 0, 1))
+    rays = np.stack([*state.points[:2], np.ones(POINTS)], axis=1)
+    arguments = problem.hosts, rays, seen, np.ascontiguousarray(problem.mask.T)
     inverse_depths, weights = kernels.triangulate(state.rotations, state.translations, *arguments)
-    np.testing.assert_allclose(inverse_depths, state.inverse_depths, rtol=1e-9)
+    np.testing.assert_allclose(inverse_depths, state.points[2], rtol=1e-9)
     assert (weights > 0.0).all()
     _, weights = kernels.triangulate(state.rotations, np.zeros_like(state.translations),
                                      *arguments)
@@ -191,14 +272,14 @@ def test_no_frame_waits_for_the_compiler():
     script = textwrap.dedent('''
         import sys
         from numba.core.dispatcher import Dispatcher
-        from kfvo_ros.backbones.geometric import bundle_adjustment, kernels
+        from kfvo_ros.backbones.geometric import bundle_adjustment, kernels, schur
         from kfvo_ros.backbones.geometric.backbone import GeometricBackbone
         from kfvo_ros.keyframes.heuristics import Every
         from kfvo_ros.odometry import KeyframeOdometry
         from kfvo_ros.sequences.synthetic import SyntheticSequence
 
         def signatures():
-            return {name: len(kernel.signatures) for module in (bundle_adjustment, kernels)
+            return {name: len(kernel.signatures) for module in (bundle_adjustment, kernels, schur)
                     for name, kernel in vars(module).items()
                     if isinstance(kernel, Dispatcher) and not name.startswith('_')}
 

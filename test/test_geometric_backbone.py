@@ -50,6 +50,18 @@ def assert_same(one: Estimate, other: Estimate) -> None:
         assert a.tobytes() == b.tobytes()
 
 
+def test_a_track_that_is_wrong_once_is_not_believed_at_all():
+    backbone = GeometricBackbone()
+    clean = window(moving_poses(8), backbone=backbone)
+    known = backbone.estimate([clean])[0].points.ids
+    view = clean.frames[3].payload
+    wrong = np.intersect1d(known, view.tracks.ids)[10]
+    assert wrong in clean.frames[5].payload.tracks.ids
+    view.points[view.tracks.ids == wrong] += 5.0 / CAMERA.fx
+    left = backbone.estimate([clean])[0].points.ids
+    assert np.array_equal(left, np.setdiff1d(known, [wrong]))
+
+
 def test_many_windows_in_one_call_are_each_alone():
     backbone = GeometricBackbone()
     a = window(moving_poses(8), 1, 0.3, backbone)

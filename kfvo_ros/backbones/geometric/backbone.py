@@ -100,7 +100,7 @@ def _estimate(window: Window, stream: GeometricStream) -> Estimate:
         return lost(window, len(SIGNAL_NAMES), Memory())
     solution = solve(observations, stream.initialiser, previous, history)
     poses = solution.T_anchor_frame
-    if solution.inliers[:, -1].sum() < MIN_TRACKS or not np.isfinite(poses).all():
+    if solution.problem.mask[-1].sum() < MIN_TRACKS or not np.isfinite(poses).all():
         return lost(window, len(SIGNAL_NAMES), Memory())
     motion = measure_motion(solution, views[-2], views[-1], stream.initialiser.focal)
     return Estimate(poses[solution.anchor:], solution.covariance(), solution.points,

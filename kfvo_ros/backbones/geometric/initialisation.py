@@ -86,7 +86,7 @@ class Initialiser:
         T_anchor_frame = geometry.relative(T_first_frame[0], T_first_frame)
         unknown = np.full(len(observations), np.nan)
         state = self._complete(observations, T_anchor_frame, unknown)
-        state = state.scaled(float(np.median(state.inverse_depths)))
+        state = state.scaled(float(np.median(state.points[2])))
         return Guess(state, np.ones(len(observations)), np.zeros(len(observations), dtype=bool))
 
     def from_previous(self, observations: Observations, previous: Previous, history: History,
@@ -108,7 +108,7 @@ class Initialiser:
                 observations, T_anchor_frame, known, visible, len(T_anchor_frame) - 1,
                 previous.T_anchor_latest)
         state = self._complete(observations, T_anchor_frame, known)
-        return Guess(state, _expect(observations, known, state.inverse_depths), is_known)
+        return Guess(state, _expect(observations, known, state.points[2]), is_known)
 
     def _best_pair(self, observations: Observations) -> tuple[int, int] | None:
         """Return the two frames whose relative pose is best determined."""
@@ -208,7 +208,8 @@ class Initialiser:
         believed &= (triangulated > NEAREST * median) & (triangulated < FARTHEST * median)
         believed &= self.focal * np.sqrt(weights) * MAX_SPREAD * median > 1.0
         filled = np.where(unknown, np.where(believed, triangulated, median), inverse_depths)
-        return State(*_rotations_and_translations(T_anchor_frame), filled)
+        return State(*_rotations_and_translations(T_anchor_frame),
+                     np.stack([*observations.rays[:, :2].T, filled]))
 
 
 def known_inverse_depths(observations: Observations, T_anchor_frame: np.ndarray,

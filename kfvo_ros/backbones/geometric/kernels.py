@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from kfvo_ros.backbones.geometric import bundle_adjustment as ba
-from kfvo_ros.backbones.geometric import lens_equations
+from kfvo_ros.backbones.geometric import schur
 from kfvo_ros.backbones.geometric.compilation import compiled
 
 END = np.iinfo(np.int64).max
@@ -227,10 +227,10 @@ def load() -> None:
     median_shifts(seen, mask, 0, correlate(seen, mask, 0))
     medians_of_nearest(seen[:, 0].copy(), seen[:, 1].copy(), ones, 1)
     median(ones)
-    problem = ba.Problem(hosts, rays, seen, mask, 1.0, 1, ones, ones)
-    state = ba.adjust(problem, ba.State(rotations, translations, ones), 1)
+    problem = ba.Problem(hosts, np.tile(np.eye(4), (2, 1, 1)), np.zeros((2, 2, 1)),
+                         np.ones((2, 1), dtype=np.bool_), 1.0, 1, ones, ones, 1.0)
+    state = ba.adjust(problem, ba.State(rotations, translations, np.ones((3, 1))), 1)
     ba.reprojection_errors(problem, state)
     ba.cost(problem, state)
-    ba.reduce(ba.linearise(problem, state), 0.0)
-    lens_equations.marginal(problem, state)
-    lens_equations.basis(seen[:, 0].copy())
+    schur.reduce(ba.linearise(problem, state, True))
+    schur.depth_information(ba.linearise(problem, state, False))

@@ -15,8 +15,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from kfvo_ros.backbones.geometric import lens_equations
+from kfvo_ros.backbones.geometric import bundle_adjustment as ba
 from kfvo_ros.backbones.geometric.problem import Problem, State
+from kfvo_ros.backbones.geometric.schur import reduce
 
 EXPECTED = 0.005
 """One standard deviation of a calibration's error: by this share points lie elsewhere, near the
@@ -44,14 +45,33 @@ class Lens:
 
     def straighten(self, points: np.ndarray) -> np.ndarray:
         """Return where points (N, 2) lie, normalised as they are."""
-        return points / (1.0 + lens_equations.basis(points) @ self.errors)[:, None]
+        return points / (1.0 + _basis(points) @ self.errors)[:, None]
 
     def told(self, problem: Problem, state: State, noise: float, newest: int) -> Lens:
         """Return what is known after a window, straightened by this lens, has been solved.
 
         Its tracks are off by `noise` [px]; `newest` is the index of its newest view.
         """
-        information, pull = lens_equations.marginal(problem, state)
+        information, pull = marginal(problem, state)
         variance = REPEATED * noise ** 2
         known = self.information + information / variance
         return Lens(self.errors + np.linalg.solve(known, pull / variance), known, newest)
+
+
+def _basis(points: np.ndarray) -> np.ndarray:
+    """Return by what share each error of the lens moves points (N, 2) off the axis, (N, 2)."""
+    off_axis = np.minimum((points ** 2).sum(axis=1), ba.WIDE_ANGLE)
+    return np.stack([np.ones(len(points)), off_axis], axis=1)
+
+
+def marginal(problem: Problem, state: State) -> tuple[np.ndarray, np.ndarray]:
+    """Return information (2, 2) on the errors of the lens, and its pull (2,) on them.
+
+    Both are for tracks off by 1 px, all else in the window set free but the first frame; the
+    errors are most likely information^-1 @ pull. Scale is held by what is expected of depths.
+    """
+    system, gradient = reduce(ba.linearise(problem._replace(fixed=1), state, True))
+    poses, lens = slice(0, -ba.LENS), slice(-ba.LENS, None)
+    right = np.column_stack([system[poses, lens], gradient[poses]])
+    eliminated = system[lens, poses] @ np.linalg.solve(system[poses, poses], right)
+    return system[lens, lens] - eliminated[:, :-1], eliminated[:, -1] - gradient[lens]

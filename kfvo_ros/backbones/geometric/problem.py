@@ -12,39 +12,46 @@ import numpy as np
 class Problem(NamedTuple):
     """What is measured in a window of F frames and P points.
 
-    ``hosts`` (P,), ``rays`` (P, 3), ``seen`` (P, F, 2) under ``mask`` (P, F), normalised and
-    undistorted; ``focal`` [px]. The first ``fixed`` frames are not moved. A point's inverse
-    depth r is drawn to ``prior_values`` (P,) with ``prior_weights`` (P,) [px^2 per unit squared].
+    ``hosts`` (P,) are the frames that see a point first, ``origins`` (F, 4, 4) where they were
+    guessed to be; ``seen`` (F, 2, P) under ``mask`` (F, P), normalised and undistorted; ``focal``
+    [px]. The first ``fixed`` frames are not moved. A point's inverse depth is drawn to
+    ``prior_values`` (P,) with ``prior_weights`` (P,) [px^2 per unit squared]. Errors well beyond
+    ``width`` [px] are let go.
     """
 
     hosts: np.ndarray
-    rays: np.ndarray
+    origins: np.ndarray
     seen: np.ndarray
     mask: np.ndarray
     focal: float
     fixed: int
     prior_weights: np.ndarray
     prior_values: np.ndarray
+    width: float
 
 
 class State(NamedTuple):
-    """Where frames and points are: rotations (F, 3, 3), translations (F, 3), depths (P,)."""
+    """Where frames are in the anchor, and points in their origins.
+
+    ``rotations`` (F, 3, 3), ``translations`` (F, 3); ``points`` (3, P) are x, y, inverse depth.
+    """
 
     rotations: np.ndarray
     translations: np.ndarray
-    inverse_depths: np.ndarray
+    points: np.ndarray
 
     def scaled(self, factor: float) -> State:
         """Return the same window in another unit."""
-        return State(self.rotations, self.translations * factor, self.inverse_depths / factor)
+        return State(self.rotations, self.translations * factor,
+                     self.points / np.array([[1.0], [1.0], [factor]]))
 
 
 class NormalEquations(NamedTuple):
-    """Gauss-Newton Hessian and gradient of half the cost, depths apart from poses.
+    """Gauss-Newton Hessian and gradient of half the cost, points apart from poses.
 
     With C = 6 (F - fixed), ``H_cc`` (C, C) and ``g_c`` (C,) belong to the poses (rotation, then
-    translation, of each free frame), ``H_pp`` (P,) and ``g_p`` (P,) to the inverse depths,
-    ``H_cp`` (C, P) couples them.
+    translation, of each free frame), ``H_pp`` (6, P), lower triangles by rows, and ``g_p``
+    (3, P) to the points, ``H_cp`` (C, 3, P) couples them.
     """
 
     H_cc: np.ndarray

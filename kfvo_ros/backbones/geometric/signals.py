@@ -57,5 +57,5 @@ def signals(solution: Solution, motion: Motion) -> np.ndarray:
         motion.survival, np.log1p(motion.flow), np.log1p(motion.parallax), motion.gap,
         np.linalg.norm(T_keyframe_newest[:3, 3]) / max(depth, 1e-9),
         geometry.rotation_angle(T_keyframe_newest[:3, :3]),
-        solution.inliers[newest, -1].mean() if newest.any() else 0.0,
+        solution.problem.mask[-1, newest].mean() if newest.any() else 0.0,
         np.log1p(solution.median_information)], dtype=np.float32)

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -16,10 +17,17 @@ from kfvo_ros.backbones.geometric import kernels
 from kfvo_ros.backbones.geometric.initialisation import Guess, Initialiser
 from kfvo_ros.backbones.geometric.memory import History, memory_of
 from kfvo_ros.backbones.geometric.observations import Observations
+from kfvo_ros.backbones.geometric.problem import NormalEquations
+from kfvo_ros.backbones.geometric.schur import depth_information, reduce
 
-ITERATIONS, FINAL_ITERATIONS = 8, 4
-MAX_ERROR = 2.0
-"""Observations farther off after the first adjustment are outliers [px]."""
+ITERATIONS, FINAL_ITERATIONS = 3, 4
+WIDE = 1.0
+"""Width of the loss at first [px]: a rough start is pulled from afar."""
+NARROW = 1.7
+"""... and in the end, times the noise: a track that slides a little, as along the rim of something
+near, should hardly pull."""
+MAX_ERROR, MAX_NOISE = 2.0, 4.5
+"""Tracks farther off anywhere after the first adjustment are outliers [px, or times the noise]."""
 KNOWN_DEPTH_PRIOR = 1.0
 """How strongly a point holds its last depth [px^2 for a depth wrong by 100 %].
 
@@ -31,34 +39,36 @@ LEAST_PRIOR_SPREAD = 0.2
 the median's."""
 SUSPICIOUS_SHARE = 0.5
 """When fewer of the newest frame's tracks fit, its first place may have been wrong."""
-MIN_INFORMATION = 30.0
-"""The median depth is known to 18 % from tracks good to a pixel: worth to be held on to."""
+MIN_INFORMATION = 10.0
+"""The median depth is known to 32 % from tracks good to a pixel: worth to be held on to."""
 MIN_PIVOT_RATIO = 1e-6
 """A system whose Cholesky factor has pivots further apart leaves directions undetermined."""
 LEAST_NOISE = 0.1
 """Tracks are never believed to be better than this [px]."""
+LEAST_FREEDOM = 0.25
+"""A window fits two views of a point exactly in one direction of two."""
 
 
 @dataclass(frozen=True)
 class Solution:
     """A solved window; frame ``anchor`` is identity, those before it are its history.
 
-    ``inliers`` (P, F) is what is left of the observations, as in ``problem``, and ``errors``
-    (P, F) theirs [px].
+    The mask of ``problem`` (F, P) is what is left of the observations, ``errors`` (F, P) theirs
+    [px].
     """
 
     observations: Observations
     anchor: int
     problem: ba.Problem
     state: ba.State
-    inliers: np.ndarray
     errors: np.ndarray
-    normal: ba.NormalEquations
+    normal: NormalEquations
 
     @property
     def solved(self) -> np.ndarray:
-        """Mask (P,) of the points that at least two frames still agree on."""
-        return self.inliers.sum(axis=1) >= 2
+        """Mask (P,) of the points whose tracks are left."""
+        solved: np.ndarray = self.problem.mask.any(axis=0)
+        return solved
 
     @cached_property
     def T_anchor_frame(self) -> np.ndarray:
@@ -79,20 +89,20 @@ class Solution:
 
     @cached_property
     def noise(self) -> float:
-        """Median error of what is left of the observations, 1 without any [px]."""
-        measured = self.inliers & (self.errors > 0.0)
-        return max(LEAST_NOISE, kernels.median(self.errors[measured]) if measured.any() else 1.0)
+        """How far the tracks that are left are off [px]."""
+        return _noise(self.problem, self.errors)
 
     @cached_property
     def points(self) -> Points:
         """Return the solved points; a depth's information is that given the poses."""
         rows = np.flatnonzero(self.solved)
-        hosts = self.observations.hosts[rows]
-        inverse_depths = self.state.inverse_depths[rows]
-        positions = kernels.place(self.state.rotations, self.state.translations, hosts,
-                                  self.observations.rays[rows], inverse_depths)
+        x, y, r = (part[rows] for part in self.state.points)
+        origins = self.problem.origins
+        positions = kernels.place(origins[:, :3, :3].copy(), origins[:, :3, 3].copy(),
+                                  self.problem.hosts[rows],
+                                  np.stack([x, y, np.ones(len(rows))], axis=1), r)
         return Points(self.observations.ids[rows], positions,
-                      self.normal.H_pp[rows] * inverse_depths ** 2)
+                      depth_information(self.normal)[rows] * r ** 2)
 
     def covariance(self) -> np.ndarray:
         """Return covariances (S, 6, 6) from the anchor on, in it, translation first.
@@ -100,11 +110,11 @@ class Solution:
         It contains how well the window's scale is tied to the past, by history and depth
         priors: where points have no parallax it grows, which reprojection errors do not show.
         """
-        system, _ = ba.reduce(self.normal, 0.0)
+        system, _ = reduce(self.normal)
         free = len(system) // 6
         blocks = self.noise ** 2 * _inverse(system).reshape(free, 6, free, 6)
         turns = np.zeros((free, 6, 6))
-        turns[:, :3, 3:], turns[:, 3:, :3] = np.eye(3), self.state.rotations[self.anchor + 1:]
+        turns[:, :3, 3:] = turns[:, 3:, :3] = self.state.rotations[self.anchor + 1:]
         covariance = np.zeros((free + 1, 6, 6))
         own = np.arange(free)
         covariance[1:] = turns @ blocks[own, :, own] @ np.swapaxes(turns, 1, 2)
@@ -134,36 +144,46 @@ def solve(observations: Observations, initialiser: Initialiser, previous: Previo
 
 @dataclass(frozen=True)
 class _Draft:
-    """A window adjusted with all its observations, of which ``inliers`` (P, F) fit."""
+    """A window adjusted with all its observations, of which ``inliers`` (F, P) fit."""
 
     problem: ba.Problem
     state: ba.State
     inliers: np.ndarray
+    noise: float
     cost: float
 
     @property
     def newest_inlier_share(self) -> float:
         """Share of the newest frame's observations that fit."""
-        return float(self.inliers[:, -1].sum()) / max(1, self.problem.mask[:, -1].sum())
+        return float(self.inliers[-1].sum()) / max(1, self.problem.mask[-1].sum())
 
 
 def _draft(observations: Observations, focal: float, guess: Guess, anchor: int) -> _Draft:
-    """Adjust from a guess and tell the outliers."""
+    """Adjust from a guess and tell the outliers: a track that is wrong once has slid before."""
     problem = _problem(observations, focal, guess, anchor + 1)
     state = ba.adjust(problem, guess.state, ITERATIONS)
-    inliers = observations.mask & (ba.reprojection_errors(problem, state) <= MAX_ERROR)
-    inliers &= (inliers.sum(axis=1) >= 2)[:, None]
-    return _Draft(problem, state, inliers, ba.cost(problem, state))
+    errors = ba.reprojection_errors(problem, state)
+    noise = _noise(problem, errors)
+    fits = errors.max(axis=0) <= max(MAX_ERROR, MAX_NOISE * noise)
+    return _Draft(problem, state, problem.mask & fits, noise, ba.cost(problem, state))
 
 
 def _finish(observations: Observations, draft: _Draft, anchor: int) -> Solution:
-    """Adjust again without the outliers."""
-    problem, state = draft.problem, draft.state
-    if (draft.inliers != observations.mask).any():
-        problem = problem._replace(mask=draft.inliers)
-        state = ba.adjust(problem, state, FINAL_ITERATIONS)
-    return Solution(observations, anchor, problem, state, draft.inliers,
-                    ba.reprojection_errors(problem, state), ba.linearise(problem, state))
+    """Adjust again without the outliers, narrowly."""
+    problem = draft.problem._replace(mask=draft.inliers, width=NARROW * draft.noise)
+    state = ba.adjust(problem, draft.state, FINAL_ITERATIONS)
+    return Solution(observations, anchor, problem, state, ba.reprojection_errors(problem, state),
+                    ba.linearise(problem, state, False))
+
+
+def _noise(problem: ba.Problem, errors: np.ndarray) -> float:
+    """Return the median of errors (F, P), had they not been fitted; 1 without any [px]."""
+    measured = 2 * problem.mask.sum()
+    if not measured:
+        return 1.0
+    fitted = 3 * problem.mask.any(axis=0).sum() + 6 * (len(problem.mask) - problem.fixed)
+    left = max(1.0 - fitted / measured, LEAST_FREEDOM)
+    return max(LEAST_NOISE, kernels.median(errors[problem.mask]) / math.sqrt(left))
 
 
 def _problem(observations: Observations, focal: float, guess: Guess, fixed: int) -> ba.Problem:
@@ -171,8 +191,11 @@ def _problem(observations: Observations, focal: float, guess: Guess, fixed: int)
     expected = guess.expected_inverse_depths
     strength = np.where(guess.known, KNOWN_DEPTH_PRIOR, NEW_DEPTH_PRIOR)
     spread = np.maximum(expected, LEAST_PRIOR_SPREAD * kernels.median(expected))
-    return ba.Problem(observations.hosts, observations.rays, observations.seen, observations.mask,
-                      focal, fixed, strength / spread ** 2, expected)
+    origins = geometry.make_transform(guess.state.rotations, guess.state.translations)
+    return ba.Problem(observations.hosts, origins,
+                      np.ascontiguousarray(observations.seen.transpose(1, 2, 0)),
+                      np.ascontiguousarray(observations.mask.T),
+                      focal, fixed, strength / spread ** 2, expected, WIDE)
 
 
 def _inverse(system: np.ndarray) -> np.ndarray:

@@ -1,0 +1,122 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Normal equations of poses and points, solved for the poses first (Schur complement); compiled.
+
+Each point has three unknowns that nothing but poses couple to others: with the Cholesky factors L
+of their own 3x3 blocks, what couples them is made white, L^-1 H_pc, and its products are what the
+poses' system loses.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from kfvo_ros.backbones.geometric.compilation import compiled
+from kfvo_ros.backbones.geometric.problem import NormalEquations
+
+TINY = 1e-9
+
+
+@compiled
+def _dot(a: np.ndarray, b: np.ndarray) -> float:
+    total = 0.0
+    for k in range(len(a)):
+        total += a[k] * b[k]
+    return total
+
+
+@compiled
+def _factor(H: np.ndarray, damping: float) -> np.ndarray:
+    """Return lower triangles (6, P) of the points' Cholesky factors, diagonals inverted."""
+    L, grown = np.empty(H.shape), 1.0 + damping
+    for k in range(H.shape[1]):
+        xx = 1.0 / math.sqrt(H[0, k] * grown + TINY)
+        yx = H[1, k] * xx
+        yy = 1.0 / math.sqrt(max(H[2, k] * grown - yx * yx, 0.0) + TINY)
+        rx = H[3, k] * xx
+        ry = (H[4, k] - rx * yx) * yy
+        rr = 1.0 / math.sqrt(max(H[5, k] * grown - rx * rx - ry * ry, 0.0) + TINY)
+        L[0, k], L[1, k], L[2, k], L[3, k], L[4, k], L[5, k] = xx, yx, yy, rx, ry, rr
+    return L
+
+
+@compiled
+def _whiten(L: np.ndarray, v: np.ndarray) -> None:
+    """Make L^-1 v of v (3, P) in place."""
+    for k in range(v.shape[1]):
+        x = v[0, k] * L[0, k]
+        y = (v[1, k] - L[1, k] * x) * L[2, k]
+        v[0, k], v[1, k] = x, y
+        v[2, k] = (v[2, k] - L[3, k] * x - L[4, k] * y) * L[5, k]
+
+
+@compiled
+def _eliminate(normal: NormalEquations, damping: float,
+               L: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return system and gradient of the poses; what belongs to points is whitened in place."""
+    size, system, gradient = len(normal.g_c), normal.H_cc.copy(), normal.g_c.copy()
+    _whiten(L, normal.g_p)
+    for row in range(size):
+        _whiten(L, normal.H_cp[row])
+    white, pull = normal.H_cp.reshape(size, normal.g_p.size), normal.g_p.reshape(normal.g_p.size)
+    for row in range(size):
+        system[row, row] += damping * normal.H_cc[row, row] + TINY
+        gradient[row] -= _dot(white[row], pull)
+        for column in range(row, size):
+            system[row, column] -= _dot(white[row], white[column])
+            system[column, row] = system[row, column]
+    return system, gradient
+
+
+@compiled
+def reduce(normal: NormalEquations) -> tuple[np.ndarray, np.ndarray]:
+    """Eliminate the points (Schur complement); return system and gradient of the poses."""
+    H_cc, g_c, H_cp, H_pp, g_p = normal
+    return _eliminate(NormalEquations(H_cc, g_c, H_cp.copy(), H_pp, g_p.copy()), 0.0,
+                      _factor(H_pp, 0.0))
+
+
+@compiled
+def _solve(system: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Solve a symmetric, positive definite system, both overwritten: no pivot is ever needed."""
+    size = len(right)
+    for pivot in range(size):
+        for row in range(pivot + 1, size):
+            share = system[pivot, row] / system[pivot, pivot]
+            right[row] -= share * right[pivot]
+            for column in range(row, size):
+                system[row, column] -= share * system[pivot, column]
+    for row in range(size - 1, -1, -1):
+        for column in range(row + 1, size):
+            right[row] -= system[row, column] * right[column]
+        right[row] /= system[row, row]
+    return right
+
+
+@compiled
+def step(normal: NormalEquations, damping: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the damped Gauss-Newton step of free poses (C,) and points (3, P).
+
+    The equations are used up: a copy of them would not fit into the processor's cache.
+    """
+    L = _factor(normal.H_pp, damping)
+    poses = -_solve(*_eliminate(normal, damping, L))
+    points = -normal.g_p
+    for row in range(len(poses)):
+        for a in range(3):
+            change, coupling = points[a], normal.H_cp[row, a]
+            for k in range(len(change)):
+                change[k] -= poses[row] * coupling[k]
+    for k in range(points.shape[1]):
+        r = points[2, k] * L[5, k]
+        y = (points[1, k] - L[4, k] * r) * L[2, k]
+        points[0, k] = (points[0, k] - L[1, k] * y - L[3, k] * r) * L[0, k]
+        points[1, k], points[2, k] = y, r
+    return poses, points
+
+
+def depth_information(normal: NormalEquations) -> np.ndarray:
+    """Return what is known of the points' inverse depths (P,), given the poses, rays unknown."""
+    return 1.0 / _factor(normal.H_pp, 0.0)[5] ** 2
