@@ -67,8 +67,7 @@ class Solution:
     @property
     def solved(self) -> np.ndarray:
         """Mask (P,) of the points whose tracks are left."""
-        solved: np.ndarray = self.problem.mask.any(axis=0)
-        return solved
+        return np.asarray(self.problem.mask.any(axis=0))
 
     @cached_property
     def T_anchor_frame(self) -> np.ndarray:
