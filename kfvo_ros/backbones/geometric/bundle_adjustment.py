@@ -59,7 +59,7 @@ def _lift(problem: Problem, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 @compiled
 def _project(problem: Problem, state: State, lifted: np.ndarray, j: int, view: np.ndarray) -> None:
-    """Fill what frame j sees of the points, `view` (5, P): p_xy / p_z, 1 / p_z, residual."""
+    """Fill what frame j sees of the points, view[:5]: p_xy / p_z, 1 / p_z, residual."""
     R, t = state.rotations[j], state.translations[j]
     for k in range(lifted.shape[1]):
         r = state.points[2, k]
@@ -103,36 +103,57 @@ def cost(problem: Problem, state: State) -> float:
 
 
 @compiled
-def _differentiate(problem: Problem, state: State, slopes: np.ndarray, j: int, view: np.ndarray,
-                   J: np.ndarray) -> None:
-    """Fill the derivatives of residuals in frame j, J (2, POSE + LENS + POINT, P).
+def _weigh(problem: Problem, j: int, view: np.ndarray) -> None:
+    """Fill view[5], the focal length times the root of the weight in the loss.
 
-    They and the residuals in `view` are multiplied by the root of the weight in the loss.
+    The residuals are multiplied by that root; it is 0 for what is unseen or behind.
     """
-    reach, R, t = problem.width ** 2, state.rotations[j], state.translations[j]
+    reach, mask = problem.width ** 2, problem.mask[j]
     for k in range(view.shape[1]):
-        u, v, near, e0, e1 = view[0, k], view[1, k], view[2, k], view[3, k], view[4, k]
+        e0, e1 = view[3, k], view[4, k]
         root = math.sqrt(reach / (reach + e0 * e0 + e1 * e1))
-        root = root if problem.mask[j, k] and near < 1.0 / MIN_DEPTH else 0.0
-        view[3, k], view[4, k] = root * e0, root * e1
-        focal, off_axis = root * problem.focal, min(u * u + v * v, WIDE_ANGLE)
+        root = root if mask[k] and view[2, k] < 1.0 / MIN_DEPTH else 0.0
+        view[3, k], view[4, k], view[5, k] = root * e0, root * e1, root * problem.focal
+
+
+@compiled
+def _differentiate_by_pose(points: np.ndarray, view: np.ndarray, J: np.ndarray) -> None:
+    """Fill J[:, :POSE], the derivatives of the weighed residuals by the pose of their frame."""
+    for k in range(view.shape[1]):
+        u, v, focal = view[0, k], view[1, k], view[5, k]
         J[0, 0, k], J[1, 0, k] = focal * u * v, focal * (1.0 + v * v)
         J[0, 1, k], J[1, 1, k] = -focal * (1.0 + u * u), -focal * u * v
         J[0, 2, k], J[1, 2, k] = focal * v, -focal * u
-        J[0, 6, k], J[1, 6, k] = focal * u, focal * v
-        J[0, 7, k], J[1, 7, k] = off_axis * focal * u, off_axis * focal * v
-        focal *= near
-        moved = focal * state.points[2, k]
+    for k in range(view.shape[1]):
+        moved = view[5, k] * view[2, k] * points[2, k]
         J[0, 3, k], J[1, 3, k] = -moved, 0.0
         J[0, 4, k], J[1, 4, k] = 0.0, -moved
-        J[0, 5, k], J[1, 5, k] = moved * u, moved * v
-        for m in range(POINT):
-            a, b, c = slopes[m, 0, k], slopes[m, 1, k], slopes[m, 2, k]
-            if m == 2:
-                a, b, c = a - t[0], b - t[1], c - t[2]
-            along = R[0, 2] * a + R[1, 2] * b + R[2, 2] * c
-            J[0, 8 + m, k] = focal * (R[0, 0] * a + R[1, 0] * b + R[2, 0] * c - u * along)
-            J[1, 8 + m, k] = focal * (R[0, 1] * a + R[1, 1] * b + R[2, 1] * c - v * along)
+        J[0, 5, k], J[1, 5, k] = moved * view[0, k], moved * view[1, k]
+
+
+@compiled
+def _differentiate_by_lens(view: np.ndarray, J: np.ndarray) -> None:
+    """Fill J[:, POSE:POSE + LENS]."""
+    for k in range(view.shape[1]):
+        u, v, focal = view[0, k], view[1, k], view[5, k]
+        off_axis = min(u * u + v * v, WIDE_ANGLE)
+        J[0, 6, k], J[1, 6, k] = focal * u, focal * v
+        J[0, 7, k], J[1, 7, k] = off_axis * focal * u, off_axis * focal * v
+
+
+@compiled
+def _differentiate_by_point(R: np.ndarray, t: np.ndarray, slopes: np.ndarray, view: np.ndarray,
+                            J: np.ndarray) -> None:
+    """Fill J[:, POSE + LENS:] in a frame at (R, t)."""
+    for m in range(POINT):
+        t0, t1, t2 = (t[0], t[1], t[2]) if m == 2 else (0.0, 0.0, 0.0)
+        for k in range(view.shape[1]):
+            a, b, c = slopes[m, 0, k] - t0, slopes[m, 1, k] - t1, slopes[m, 2, k] - t2
+            along, focal = R[0, 2] * a + R[1, 2] * b + R[2, 2] * c, view[5, k] * view[2, k]
+            across = R[0, 0] * a + R[1, 0] * b + R[2, 0] * c
+            down = R[0, 1] * a + R[1, 1] * b + R[2, 1] * c
+            J[0, 8 + m, k] = focal * (across - view[0, k] * along)
+            J[1, 8 + m, k] = focal * (down - view[1, k] * along)
 
 
 @compiled
@@ -163,17 +184,22 @@ def linearise(problem: Problem, state: State, with_lens: bool) -> NormalEquation
     size = poses + LENS if with_lens else poses
     H_cc, g_c, H_cp = np.zeros((size, size)), np.zeros(size), np.zeros((size, POINT, points))
     H_pp, g_p = np.zeros((6, points)), np.zeros((POINT, points))
-    view, J = np.empty((5, points)), np.empty((2, POSE + LENS + POINT, points))
+    view, J = np.empty((6, points)), np.empty((2, POSE + LENS + POINT, points))
     lifted, slopes = _lift(problem, state.points)
     for k in range(points):
         H_pp[5, k] = problem.prior_weights[k]
         g_p[2, k] = problem.prior_weights[k] * (state.points[2, k] - problem.prior_values[k])
     for j in range(frames):
         _project(problem, state, lifted, j, view)
-        _differentiate(problem, state, slopes, j, view, J)
+        _weigh(problem, j, view)
+        _differentiate_by_point(state.rotations[j], state.translations[j], slopes, view, J)
+        if j >= fixed:
+            _differentiate_by_pose(state.points, view, J)
+        if with_lens:
+            _differentiate_by_lens(view, J)
         triangle = 0
         for m in range(POINT):
-            _add_products(J, 8 + m, view[3:], g_p[m])
+            _add_products(J, 8 + m, view[3:5], g_p[m])
             for n in range(m + 1):
                 _add_products(J, 8 + m, J[:, 8 + n], H_pp[triangle])
                 triangle += 1
