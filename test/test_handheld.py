@@ -1,0 +1,88 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Turning on the spot, as people do who hold a camera: little parallax, and much noise."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from odometry_scenes import RATE_NS
+
+from kfvo_ros import geometry, metrics
+from kfvo_ros.backbones.base import Encoded
+from kfvo_ros.backbones.geometric.backbone import GeometricBackbone
+from kfvo_ros.backbones.geometric.observations import View
+from kfvo_ros.camera import Camera
+from kfvo_ros.keyframes.heuristics import Every
+from kfvo_ros.odometry import KeyframeOdometry
+from kfvo_ros.sequences.base import Frame
+from kfvo_ros.tracking import Tracks
+from kfvo_ros.trajectory import Trajectory
+
+CAMERA = Camera(640, 480, 520.0, 520.0, 319.5, 239.5)
+FRAMES, POINTS, TRACKS, NOISE = 240, 6000, 300, 0.3
+NO_IMAGE = np.zeros((0, 0), dtype=np.uint8)
+DEATHS = 0.03
+"""Share of the tracks that end at every frame, of those still in the image."""
+
+
+def wave(rng: np.random.Generator, size: float) -> np.ndarray:
+    """Return a sum of slow sines (FRAMES, 3)."""
+    phases, turns = rng.uniform(0.0, 2.0 * np.pi, (6, 3)), rng.uniform(0.15, 0.6, (6, 3))
+    seconds = np.arange(FRAMES)[:, None, None] / 30.0
+    return size * np.sin(2.0 * np.pi * turns * seconds + phases).sum(axis=1) / np.sqrt(3.0)
+
+
+def tracks_of(rng: np.random.Generator, T_world_camera: np.ndarray) -> Iterator[Tracks]:
+    """Yield what is seen of points all around, at 1.2 to 4 m, `NOISE` [px] off in each axis."""
+    points = rng.normal(size=(POINTS, 3))
+    points *= rng.uniform(1.2, 4.0, (POINTS, 1)) / np.linalg.norm(points, axis=1, keepdims=True)
+    ids, count = np.full(POINTS, -1), 0
+    for T_camera_world in geometry.invert(T_world_camera):
+        x, y, z = (points @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]).T
+        pixels = np.stack([x, y], axis=1) / np.maximum(z, 1e-6)[:, None] * CAMERA.fx
+        pixels += (CAMERA.cx, CAMERA.cy)
+        seen = (z > 0.1) & ((pixels > 4.0) & (pixels < (636.0, 476.0))).all(axis=1)
+        ids[~seen | (rng.random(POINTS) < DEATHS)] = -1
+        born = rng.permutation(np.flatnonzero(seen & (ids < 0)))[:TRACKS - (ids >= 0).sum()]
+        ids[born] = np.arange(count, count + len(born))
+        count += len(born)
+        rows = np.flatnonzero(ids >= 0)
+        rows = rows[np.argsort(ids[rows])]
+        yield Tracks(ids[rows], pixels[rows] + NOISE * rng.normal(size=(len(rows), 2)))
+
+
+def replay(seed: int) -> tuple[np.ndarray, Trajectory]:
+    """Return true poses of 8 s that turn by tens of degrees and move by centimetres, and ours."""
+    rng = np.random.default_rng(seed)
+    truth = geometry.make_transform(geometry.exp_so3(wave(rng, 0.3)), wave(rng, 0.03))
+    backbone, placed = GeometricBackbone(), []
+    odometry = KeyframeOdometry(backbone, Every())
+    for index, tracks in enumerate(tracks_of(rng, truth)):
+        encoded = Encoded(index * RATE_NS, np.zeros(48, dtype=np.float32),
+                          View(index, tracks, CAMERA.undistort(tracks.pixels)), tracks)
+        window = odometry.begin(Frame(encoded.stamp_ns, NO_IMAGE, CAMERA), encoded)
+        odometry.integrate(None if window is None else backbone.estimate([window])[0])
+        placed += odometry.commit(True, {}).final
+    placed += odometry.finish()
+    return truth, Trajectory(np.array([each.stamp_ns for each in placed]),
+                             np.stack([each.T_world_camera for each in placed]))
+
+
+def spread(positions: np.ndarray) -> float:
+    return float(np.linalg.norm(positions - positions.mean(axis=0)))
+
+
+def test_noise_does_not_pass_for_parallax():
+    """Were the hosts' measurements of rays exact, scale would shrink and the error double."""
+    drifts, errors = [], []
+    for seed in range(3):
+        truth, found = replay(seed)
+        first, last = (spread(truth[part, :3, 3]) / spread(found.poses[part, :3, 3])
+                       for part in (slice(0, 60), slice(-60, None)))
+        drifts.append(np.log(last / first))
+        errors.append(metrics.absolute_trajectory_error(
+            found, Trajectory(found.stamps_ns, truth)).rmse)
+    assert abs(np.mean(drifts)) < 0.1, drifts
+    assert np.mean(errors) < 0.008, errors
