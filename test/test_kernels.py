@@ -1,0 +1,60 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What the geometric backbone compiles: before the first frame, and as NumPy would have it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import textwrap
+
+import numpy as np
+import pytest
+
+from kfvo_ros.backbones.geometric import kernels
+
+
+def test_no_frame_waits_for_the_compiler():
+    script = textwrap.dedent('''
+        import sys
+        from numba.core.dispatcher import Dispatcher
+        from kfvo_ros.backbones.geometric import bundle_adjustment, kernels, schur
+        from kfvo_ros.backbones.geometric.backbone import GeometricBackbone
+        from kfvo_ros.keyframes.heuristics import Every
+        from kfvo_ros.odometry import KeyframeOdometry
+        from kfvo_ros.sequences.synthetic import SyntheticSequence
+
+        def signatures():
+            return {name: len(kernel.signatures) for module in (bundle_adjustment, kernels, schur)
+                    for name, kernel in vars(module).items()
+                    if isinstance(kernel, Dispatcher) and not name.startswith('_')}
+
+        backbone = GeometricBackbone()
+        before = signatures()
+        odometry = KeyframeOdometry(backbone, Every())
+        statuses = [odometry.process(frame).status.value
+                    for frame in SyntheticSequence(0, 'fast', 14, 320, 240)]
+        assert statuses[-1] == 'ok', statuses
+        print(before, signatures())
+        sys.exit(not before or max(before.values()) != 1 or signatures() != before)
+    ''')
+    done = subprocess.run([sys.executable, '-c', script], capture_output=True, text=True,
+                          timeout=120)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.parametrize('count', range(1, 12))
+def test_median_is_that_of_numpy(count):
+    rng = np.random.default_rng(count)
+    for values in (rng.normal(size=count), rng.integers(0, 4, count).astype(np.float64)):
+        before = values.copy()
+        assert kernels.median(values) == np.median(values)
+        assert np.array_equal(values, before)
+
+
+def test_nearest_known_points_tell_the_median():
+    rng = np.random.default_rng(2)
+    places, known, values = rng.random((9, 2)), rng.random((40, 2)), rng.random(40)
+    distances = np.linalg.norm(places[:, None] - known, axis=2)
+    expected = np.median(values[np.argsort(distances, axis=1)[:, :5]], axis=1)
+    assert np.array_equal(kernels.medians_of_nearest(places, known, values, 5), expected)
