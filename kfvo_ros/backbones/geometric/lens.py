@@ -60,8 +60,8 @@ class Lens:
 
 def _basis(points: np.ndarray) -> np.ndarray:
     """Return by what share each error of the lens moves points (N, 2) off the axis, (N, 2)."""
-    off_axis = np.minimum((points ** 2).sum(axis=1), ba.WIDE_ANGLE)
-    return np.stack([np.ones(len(points)), off_axis], axis=1)
+    x, y = points.T
+    return np.stack([np.ones(len(points)), np.minimum(x * x + y * y, ba.WIDE_ANGLE)], axis=1)
 
 
 def marginal(problem: Problem, state: State) -> tuple[np.ndarray, np.ndarray]:
