@@ -231,7 +231,7 @@ def test_tiny_images(width, height):
 
 def test_noise_without_any_motion_in_it():
     rng = np.random.default_rng(0)
-    images = [rng.integers(0, 256, (120, 160), dtype=np.uint8) for _ in range(24)]
+    images = [rng.integers(0, 256, (120, 160), dtype=np.uint8) for _ in range(60)]
     camera = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)
     result = checked(restamped(images, camera))
     assert 'lost' in result.statuses

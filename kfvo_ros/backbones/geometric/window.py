@@ -26,8 +26,9 @@ WIDE = 1.0
 NARROW = 1.7
 """... and in the end, times the noise: a track that slides a little, as along the rim of something
 near, should hardly pull."""
-MAX_ERROR, MAX_NOISE = 2.0, 4.5
-"""Tracks farther off anywhere after the first adjustment are outliers [px, or times the noise]."""
+MAX_NOISE, MAX_ERROR = 4.5, (2.0, 5.0)
+"""Tracks farther off anywhere after the first adjustment are outliers: so many times the noise,
+within bounds [px], for where nothing fits noise has none."""
 KNOWN_DEPTH_PRIOR = 1.0
 """How strongly a point holds its last depth [px^2 for a depth wrong by 100 %].
 
@@ -163,7 +164,7 @@ def _draft(observations: Observations, focal: float, guess: Guess, anchor: int) 
     state = ba.adjust(problem, guess.state, ITERATIONS)
     errors = ba.reprojection_errors(problem, state)
     noise = _noise(problem, errors)
-    fits = errors.max(axis=0) <= max(MAX_ERROR, MAX_NOISE * noise)
+    fits = errors.max(axis=0) <= np.clip(MAX_NOISE * noise, *MAX_ERROR)
     return _Draft(problem, state, problem.mask & fits, noise, ba.cost(problem, state))
 
 
