@@ -25,7 +25,7 @@ from kfvo_ros.sequences.base import Frame
 from kfvo_ros.tracking import FEATURES, Tracker
 
 THUMBNAIL = (8, 6)
-MIN_TRACKS = 16
+MIN_TRACKS = 12
 """The newest frame needs as many tracks in common with the window to be placed."""
 HELD_PARALLAX = 1.0
 """With less parallax to every keyframe of the window a frame tells nothing of translation [px]."""
