@@ -213,8 +213,8 @@ def test_a_host_is_believed_no_more_than_others():
     """Where nothing moves, its noise taken for truth would be parallax of one sign."""
     problem, truth = window(fixed=FRAMES - 1)
     still = ba.State(np.tile(np.eye(3), (FRAMES, 1, 1)), np.zeros((FRAMES, 3)), truth.points)
-    problem = problem._replace(origins=np.tile(np.eye(4), (FRAMES, 1, 1)), width=100.0)
-    problem = problem._replace(hosts=np.zeros(POINTS, dtype=np.int64),
+    problem = problem._replace(origins=np.tile(np.eye(4), (FRAMES, 1, 1)), width=100.0,
+                               hosts=np.zeros(POINTS, dtype=np.int64),
                                mask=np.ones_like(problem.mask))
     noise = np.random.default_rng(3).choice([-1.0, 1.0], (2, POINTS)) / FOCAL
     seen = project(problem, still)

@@ -62,6 +62,12 @@ def test_a_track_that_is_wrong_once_is_not_believed_at_all():
     assert np.array_equal(left, np.setdiff1d(known, [wrong]))
 
 
+def test_where_nothing_fits_noise_is_no_excuse():
+    """Bounds of outliers that grew with the noise for ever would let everything pass."""
+    backbone = GeometricBackbone()
+    assert backbone.estimate([window(moving_poses(8), 0, 12.0, backbone)])[0].status is Status.LOST
+
+
 def test_many_windows_in_one_call_are_each_alone():
     backbone = GeometricBackbone()
     a = window(moving_poses(8), 1, 0.3, backbone)

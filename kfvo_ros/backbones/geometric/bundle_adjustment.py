@@ -23,7 +23,7 @@ import numpy as np
 
 from kfvo_ros.backbones.geometric.compilation import compiled
 from kfvo_ros.backbones.geometric.problem import NormalEquations, Problem, State
-from kfvo_ros.backbones.geometric.schur import step
+from kfvo_ros.backbones.geometric.schur import dot, step
 
 MIN_DEPTH = 1e-3
 """A point nearer than this share of its host depth, or behind, has no residual ..."""
@@ -157,14 +157,6 @@ def _differentiate_by_point(R: np.ndarray, t: np.ndarray, slopes: np.ndarray, vi
 
 
 @compiled
-def _dot(a: np.ndarray, b: np.ndarray) -> float:
-    total = 0.0
-    for k in range(len(a)):
-        total += a[k] * b[k]
-    return total
-
-
-@compiled
 def _add_products(J: np.ndarray, m: int, other: np.ndarray, total: np.ndarray) -> None:
     """Add what each point has of J_m^T other to `total` (P,)."""
     first, second, a, b = J[0, m], J[1, m], other[0], other[1]
@@ -206,10 +198,10 @@ def linearise(problem: Problem, state: State, with_lens: bool) -> NormalEquation
         first, last = 0 if j >= fixed else POSE, POSE + LENS if with_lens else POSE
         for m in range(first, last):
             row = POSE * (j - fixed) + m if m < POSE else poses + m - POSE
-            g_c[row] += _dot(J[0, m], view[3]) + _dot(J[1, m], view[4])
+            g_c[row] += dot(J[0, m], view[3]) + dot(J[1, m], view[4])
             for n in range(first, m + 1):
                 column = POSE * (j - fixed) + n if n < POSE else poses + n - POSE
-                H_cc[row, column] += _dot(J[0, m], J[0, n]) + _dot(J[1, m], J[1, n])
+                H_cc[row, column] += dot(J[0, m], J[0, n]) + dot(J[1, m], J[1, n])
                 H_cc[column, row] = H_cc[row, column]
             for n in range(POINT):
                 _add_products(J, m, J[:, 8 + n], H_cp[row, n])

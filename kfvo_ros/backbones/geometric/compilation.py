@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """How the loops of this backbone are compiled: once, kept on disk, free of the interpreter.
 
-Whoever changes a compiled function that another file calls (`schur.step`) has to remove that
+Whoever changes a compiled function that another file calls (those of schur.py) has to remove that
 file's part of the cache, in __pycache__: the compiler looks at the caller's file only.
 """
 

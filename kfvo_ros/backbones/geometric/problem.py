@@ -41,7 +41,7 @@ class State(NamedTuple):
     points: np.ndarray
 
     def scaled(self, factor: float) -> State:
-        """Return the same window in another unit."""
+        """Return the same window in another unit, which its origins have to be in too."""
         return State(self.rotations, self.translations * factor,
                      self.points / np.array([[1.0], [1.0], [factor]]))
 

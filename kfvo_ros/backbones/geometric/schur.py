@@ -20,7 +20,8 @@ TINY = 1e-9
 
 
 @compiled
-def _dot(a: np.ndarray, b: np.ndarray) -> float:
+def dot(a: np.ndarray, b: np.ndarray) -> float:
+    """Return the product of two vectors (N,): BLAS would take longer to be called."""
     total = 0.0
     for k in range(len(a)):
         total += a[k] * b[k]
@@ -63,9 +64,9 @@ def _eliminate(normal: NormalEquations, damping: float,
     white, pull = normal.H_cp.reshape(size, normal.g_p.size), normal.g_p.reshape(normal.g_p.size)
     for row in range(size):
         system[row, row] += damping * normal.H_cc[row, row] + TINY
-        gradient[row] -= _dot(white[row], pull)
+        gradient[row] -= dot(white[row], pull)
         for column in range(row, size):
-            system[row, column] -= _dot(white[row], white[column])
+            system[row, column] -= dot(white[row], white[column])
             system[column, row] = system[row, column]
     return system, gradient
 

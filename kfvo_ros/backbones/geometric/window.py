@@ -54,15 +54,13 @@ LEAST_FREEDOM = 0.25
 class Solution:
     """A solved window; frame ``anchor`` is identity, those before it are its history.
 
-    The mask of ``problem`` (F, P) is what is left of the observations, ``errors`` (F, P) theirs
-    [px].
+    The mask of ``problem`` (F, P) is what is left of the observations.
     """
 
     observations: Observations
     anchor: int
     problem: ba.Problem
     state: ba.State
-    errors: np.ndarray
     normal: NormalEquations
 
     @property
@@ -90,7 +88,7 @@ class Solution:
     @cached_property
     def noise(self) -> float:
         """How far the tracks that are left are off [px]."""
-        return _noise(self.problem, self.errors)
+        return _noise(self.problem, ba.reprojection_errors(self.problem, self.state))
 
     @cached_property
     def points(self) -> Points:
@@ -172,8 +170,7 @@ def _finish(observations: Observations, draft: _Draft, anchor: int) -> Solution:
     """Adjust again without the outliers, narrowly."""
     problem = draft.problem._replace(mask=draft.inliers, width=NARROW * draft.noise)
     state = ba.adjust(problem, draft.state, FINAL_ITERATIONS)
-    return Solution(observations, anchor, problem, state, ba.reprojection_errors(problem, state),
-                    ba.linearise(problem, state, False))
+    return Solution(observations, anchor, problem, state, ba.linearise(problem, state, False))
 
 
 def _noise(problem: ba.Problem, errors: np.ndarray) -> float:
