@@ -23,7 +23,7 @@ import numpy as np
 
 from kfvo_ros.backbones.geometric.compilation import compiled
 from kfvo_ros.backbones.geometric.problem import NormalEquations, Problem, State
-from kfvo_ros.backbones.geometric.schur import dot, step
+from kfvo_ros.backbones.geometric.schur import add_products, dot, step
 
 MIN_DEPTH = 1e-3
 """A point nearer than this share of its host depth, or behind, has no residual ..."""
@@ -121,14 +121,14 @@ def _differentiate_by_pose(points: np.ndarray, view: np.ndarray, J: np.ndarray) 
     """Fill J[:, :POSE], the derivatives of the weighed residuals by the pose of their frame."""
     for k in range(view.shape[1]):
         u, v, focal = view[0, k], view[1, k], view[5, k]
-        J[0, 0, k], J[1, 0, k] = focal * u * v, focal * (1.0 + v * v)
-        J[0, 1, k], J[1, 1, k] = -focal * (1.0 + u * u), -focal * u * v
-        J[0, 2, k], J[1, 2, k] = focal * v, -focal * u
+        J[0, 0, k], J[0, 1, k] = focal * u * v, focal * (1.0 + v * v)
+        J[1, 0, k], J[1, 1, k] = -focal * (1.0 + u * u), -focal * u * v
+        J[2, 0, k], J[2, 1, k] = focal * v, -focal * u
     for k in range(view.shape[1]):
         moved = view[5, k] * view[2, k] * points[2, k]
-        J[0, 3, k], J[1, 3, k] = -moved, 0.0
-        J[0, 4, k], J[1, 4, k] = 0.0, -moved
-        J[0, 5, k], J[1, 5, k] = moved * view[0, k], moved * view[1, k]
+        J[3, 0, k], J[3, 1, k] = -moved, 0.0
+        J[4, 0, k], J[4, 1, k] = 0.0, -moved
+        J[5, 0, k], J[5, 1, k] = moved * view[0, k], moved * view[1, k]
 
 
 @compiled
@@ -137,8 +137,8 @@ def _differentiate_by_lens(view: np.ndarray, J: np.ndarray) -> None:
     for k in range(view.shape[1]):
         u, v, focal = view[0, k], view[1, k], view[5, k]
         off_axis = min(u * u + v * v, WIDE_ANGLE)
-        J[0, 6, k], J[1, 6, k] = focal * u, focal * v
-        J[0, 7, k], J[1, 7, k] = off_axis * focal * u, off_axis * focal * v
+        J[6, 0, k], J[6, 1, k] = focal * u, focal * v
+        J[7, 0, k], J[7, 1, k] = off_axis * focal * u, off_axis * focal * v
 
 
 @compiled
@@ -152,16 +152,35 @@ def _differentiate_by_point(R: np.ndarray, t: np.ndarray, slopes: np.ndarray, vi
             along, focal = R[0, 2] * a + R[1, 2] * b + R[2, 2] * c, view[5, k] * view[2, k]
             across = R[0, 0] * a + R[1, 0] * b + R[2, 0] * c
             down = R[0, 1] * a + R[1, 1] * b + R[2, 1] * c
-            J[0, 8 + m, k] = focal * (across - view[0, k] * along)
-            J[1, 8 + m, k] = focal * (down - view[1, k] * along)
+            J[8 + m, 0, k] = focal * (across - view[0, k] * along)
+            J[8 + m, 1, k] = focal * (down - view[1, k] * along)
 
 
 @compiled
-def _add_products(J: np.ndarray, m: int, other: np.ndarray, total: np.ndarray) -> None:
-    """Add what each point has of J_m^T other to `total` (P,)."""
-    first, second, a, b = J[0, m], J[1, m], other[0], other[1]
-    for k in range(len(total)):
-        total[k] += first[k] * a[k] + second[k] * b[k]
+def _add_points(J: np.ndarray, view: np.ndarray, H_pp: np.ndarray, g_p: np.ndarray) -> None:
+    """Add what a frame says of points by themselves."""
+    for k in range(view.shape[1]):
+        x0, x1, y0, y1 = J[8, 0, k], J[8, 1, k], J[9, 0, k], J[9, 1, k]
+        r0, r1, e0, e1 = J[10, 0, k], J[10, 1, k], view[3, k], view[4, k]
+        H_pp[0, k] += x0 * x0 + x1 * x1
+        H_pp[1, k] += y0 * x0 + y1 * x1
+        H_pp[2, k] += y0 * y0 + y1 * y1
+        H_pp[3, k] += r0 * x0 + r1 * x1
+        H_pp[4, k] += r0 * y0 + r1 * y1
+        H_pp[5, k] += r0 * r0 + r1 * r1
+        g_p[0, k] += x0 * e0 + x1 * e1
+        g_p[1, k] += y0 * e0 + y1 * e1
+        g_p[2, k] += r0 * e0 + r1 * e1
+
+
+@compiled
+def _add_coupling(J: np.ndarray, m: int, H_mp: np.ndarray) -> None:
+    """Add the products of J_m with the derivatives by the points, (3, P)."""
+    for k in range(J.shape[2]):
+        first, second = J[m, 0, k], J[m, 1, k]
+        H_mp[0, k] += first * J[8, 0, k] + second * J[8, 1, k]
+        H_mp[1, k] += first * J[9, 0, k] + second * J[9, 1, k]
+        H_mp[2, k] += first * J[10, 0, k] + second * J[10, 1, k]
 
 
 @compiled
@@ -176,7 +195,8 @@ def linearise(problem: Problem, state: State, with_lens: bool) -> NormalEquation
     size = poses + LENS if with_lens else poses
     H_cc, g_c, H_cp = np.zeros((size, size)), np.zeros(size), np.zeros((size, POINT, points))
     H_pp, g_p = np.zeros((6, points)), np.zeros((POINT, points))
-    view, J = np.empty((6, points)), np.empty((2, POSE + LENS + POINT, points))
+    view, J = np.empty((6, points)), np.empty((POSE + LENS + POINT, 2, points))
+    rows, residuals = J.reshape(len(J), 2 * points), view[3:5].reshape(2 * points)
     lifted, slopes = _lift(problem, state.points)
     for k in range(points):
         H_pp[5, k] = problem.prior_weights[k]
@@ -185,26 +205,24 @@ def linearise(problem: Problem, state: State, with_lens: bool) -> NormalEquation
         _project(problem, state, lifted, j, view)
         _weigh(problem, j, view)
         _differentiate_by_point(state.rotations[j], state.translations[j], slopes, view, J)
+        _add_points(J, view, H_pp, g_p)
+        pose = POSE * (j - fixed)
         if j >= fixed:
             _differentiate_by_pose(state.points, view, J)
+            add_products(rows[:POSE], 1.0, H_cc[pose:pose + POSE, pose:pose + POSE])
+            for m in range(POSE):
+                g_c[pose + m] = dot(rows[m], residuals)
+                _add_coupling(J, m, H_cp[pose + m])
         if with_lens:
             _differentiate_by_lens(view, J)
-        triangle = 0
-        for m in range(POINT):
-            _add_products(J, 8 + m, view[3:5], g_p[m])
-            for n in range(m + 1):
-                _add_products(J, 8 + m, J[:, 8 + n], H_pp[triangle])
-                triangle += 1
-        first, last = 0 if j >= fixed else POSE, POSE + LENS if with_lens else POSE
-        for m in range(first, last):
-            row = POSE * (j - fixed) + m if m < POSE else poses + m - POSE
-            g_c[row] += dot(J[0, m], view[3]) + dot(J[1, m], view[4])
-            for n in range(first, m + 1):
-                column = POSE * (j - fixed) + n if n < POSE else poses + n - POSE
-                H_cc[row, column] += dot(J[0, m], J[0, n]) + dot(J[1, m], J[1, n])
-                H_cc[column, row] = H_cc[row, column]
-            for n in range(POINT):
-                _add_products(J, m, J[:, 8 + n], H_cp[row, n])
+            for m in range(POSE, POSE + LENS):
+                row = poses + m - POSE
+                g_c[row] += dot(rows[m], residuals)
+                _add_coupling(J, m, H_cp[row])
+                for n in range(0 if j >= fixed else POSE, m + 1):
+                    column = pose + n if n < POSE else poses + n - POSE
+                    H_cc[row, column] += dot(rows[m], rows[n])
+                    H_cc[column, row] = H_cc[row, column]
     return NormalEquations(H_cc, g_c, H_cp, H_pp, g_p)
 
 

@@ -29,6 +29,44 @@ def dot(a: np.ndarray, b: np.ndarray) -> float:
 
 
 @compiled
+def _add_nine(A: np.ndarray, B: np.ndarray, weight: float, total: np.ndarray) -> None:
+    """Add weight A B^T of three rows each: a number read is used three times."""
+    a0, a1, a2, b0, b1, b2 = A[0], A[1], A[2], B[0], B[1], B[2]
+    s00 = s01 = s02 = s10 = s11 = s12 = s20 = s21 = s22 = 0.0
+    for k in range(len(a0)):
+        s00 += a0[k] * b0[k]
+        s01 += a0[k] * b1[k]
+        s02 += a0[k] * b2[k]
+        s10 += a1[k] * b0[k]
+        s11 += a1[k] * b1[k]
+        s12 += a1[k] * b2[k]
+        s20 += a2[k] * b0[k]
+        s21 += a2[k] * b1[k]
+        s22 += a2[k] * b2[k]
+    for m, (x, y, z) in enumerate(((s00, s01, s02), (s10, s11, s12), (s20, s21, s22))):
+        total[m, 0] += weight * x
+        total[m, 1] += weight * y
+        total[m, 2] += weight * z
+
+
+@compiled
+def add_products(A: np.ndarray, weight: float, total: np.ndarray) -> None:
+    """Add weight A A^T of A (M, N) to `total` (M, M), which is and stays symmetric."""
+    size = len(A)
+    threes = size - size % 3
+    for row in range(0, threes, 3):
+        for column in range(0, row + 1, 3):
+            _add_nine(A[row:row + 3], A[column:column + 3], weight,
+                      total[row:row + 3, column:column + 3])
+    for row in range(threes, size):
+        for column in range(row + 1):
+            total[row, column] += weight * dot(A[row], A[column])
+    for row in range(size):
+        for column in range(row):
+            total[column, row] = total[row, column]
+
+
+@compiled
 def _factor(H: np.ndarray, damping: float) -> np.ndarray:
     """Return lower triangles (6, P) of the points' Cholesky factors, diagonals inverted."""
     L, grown = np.empty(H.shape), 1.0 + damping
@@ -62,12 +100,10 @@ def _eliminate(normal: NormalEquations, damping: float,
     for row in range(size):
         _whiten(L, normal.H_cp[row])
     white, pull = normal.H_cp.reshape(size, normal.g_p.size), normal.g_p.reshape(normal.g_p.size)
+    add_products(white, -1.0, system)
     for row in range(size):
         system[row, row] += damping * normal.H_cc[row, row] + TINY
         gradient[row] -= dot(white[row], pull)
-        for column in range(row, size):
-            system[row, column] -= dot(white[row], white[column])
-            system[column, row] = system[row, column]
     return system, gradient
 
 
