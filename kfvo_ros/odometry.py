@@ -14,6 +14,7 @@ from kfvo_ros.backbones.base import (
     Backbone,
     Encoded,
     Estimate,
+    Points,
     Previous,
     Status,
     Stream,
@@ -75,7 +76,7 @@ class Update:
     ``T_world_camera`` (4, 4) is the estimate at arrival, ``covariance`` (6, 6) its covariance
     in the world, translation first, and ``window_covariance`` the part that arose in this
     window; ``final`` are the frames whose poses became final, in input order;
-    ``median_depth`` of the window's points [trajectory units], None without points;
+    ``points`` of the window in the world, None without;
     ``durations`` [s] of the steps encode, estimate, decide; ``intrinsics`` K (3, 3) [px] where
     the backbone estimates them; ``parts`` [s] of these steps, where it tells them.
     """
@@ -87,10 +88,18 @@ class Update:
     status: Status
     is_keyframe: bool
     final: tuple[Placed, ...]
-    median_depth: float | None
+    points: Points | None
     durations: dict[str, float]
     intrinsics: np.ndarray | None = None
     parts: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def median_depth(self) -> float | None:
+        """Return how far away the points are [trajectory units], None without."""
+        if self.points is None or not len(self.points.ids):
+            return None
+        return float(np.median(np.linalg.norm(
+            self.points.positions - self.T_world_camera[:3, 3], axis=1)))
 
 
 class KeyframeOdometry:
@@ -205,11 +214,9 @@ class KeyframeOdometry:
         del self._pending[:-MAX_PENDING]
         final = tuple(self._final)
         self._final.clear()
-        points = self._known.points
-        depth = None if points is None or not len(points.ids) else float(np.median(
-            np.linalg.norm(points.positions - newest.T_world_camera[:3, 3], axis=1)))
         return Update(newest.encoded.stamp_ns, newest.T_world_camera, self._covariance,
-                      self._window_covariance, self._status, keep, final, depth, durations,
+                      self._window_covariance, self._status, keep, final,
+                      self._known.points, durations,
                       self._intrinsics, self._parts)
 
     def finish(self) -> tuple[Placed, ...]:

@@ -17,7 +17,7 @@ STANDSTILL = 1e-3
 
 
 class ScaleAligner:
-    """Trajectory units per unit of a window; remembers the last answer and the scene's depth.
+    """Trajectory units per unit of a window; remembers the last answer and the scene's depths.
 
     `rule`: ``none`` trusts the backbone's unit, ``translation`` compares the keyframes' known
     distances to the anchor with the new ones, ``depth`` compares the depths of shared points
@@ -27,7 +27,7 @@ class ScaleAligner:
     def __init__(self, rule: str) -> None:
         self.rule = rule
         self._last = 1.0
-        self._median_depth = 1.0
+        self._depths = np.ones(1)
 
     def align(self, estimate: Estimate, previous: Previous | None) -> float:
         """Return the factor that brings `estimate` into trajectory units."""
@@ -43,14 +43,14 @@ class ScaleAligner:
                 scale = compare_translations(previous.T_anchor_frame, estimate.T_anchor_frame)
             self._last = self._last if scale is None else scale
         if estimate.points is not None and len(estimate.points.ids):
-            self._median_depth = self._last * float(np.median(estimate.points.depths))
+            self._depths = self._last * estimate.points.depths
         return self._last
 
     def _from_median_depth(self, points: Points | None) -> float:
         """Start a segment at the median depth of the last one; the very first at 1."""
         if points is None or len(points.ids) == 0:
             return self._last
-        return self._median_depth / float(np.median(points.depths))
+        return float(np.median(self._depths) / np.median(points.depths))
 
 
 def compare_depths(known: Points | None, new: Points | None) -> float | None:
