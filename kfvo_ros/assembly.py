@@ -28,7 +28,8 @@ def make_backbone(options: OdometryOptions, vggt: VggtOptions | None = None) -> 
         from kfvo_ros.backbones.vggt.loading import load_backbone
         vggt = vggt or VggtOptions()
         return load_backbone(vggt.weights, vggt.revision, vggt.device, vggt.precision,
-                             vggt.image_width, not vggt.recompute, options.window_size)
+                             vggt.image_width, not vggt.recompute, options.window_size,
+                             vggt.compile)
     from kfvo_ros.backbones.geometric.backbone import GeometricBackbone
     return GeometricBackbone(options.seed)
 

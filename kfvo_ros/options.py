@@ -73,6 +73,9 @@ class VggtOptions:
     recompute: bool = option(
         False, 'vggt: compute every window in full instead of reusing what is known of its '
         'frames; the poses are the same')
+    compile: bool = option(
+        False, 'vggt: have torch compile the model, a minute or so at the start; worth trying on '
+        'a GPU')
 
 
 @dataclass(frozen=True)

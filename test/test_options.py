@@ -30,7 +30,7 @@ OTHER = {
                                      backbone='vggt', flow_threshold=12.5, survival_share=0.25,
                                      policy='a policy.safetensors', window_size=5, seed=17),
     VggtOptions: VggtOptions(weights='model.pt', revision='v1', device='cuda:1', precision='fp16',
-                             image_width=140, recompute=True),
+                             image_width=140, recompute=True, compile=True),
     SequenceOptions: SequenceOptions(kind='tum', camera='a b.yaml', image_topic='/cam0/image',
                                      ground_truth_topic='/vicon',
                                      ground_truth_to_camera='0 0 0 0 0 0 1', rate=29.97, stop=3),

@@ -20,6 +20,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
+from kfvo_ros.backbones.vggt.compiling import compile_blocks, compiler_needed
 from kfvo_ros.backbones.vggt.config import PATCH, VggtConfig
 from kfvo_ros.backbones.vggt.out_of_memory import memory_bounded
 from kfvo_ros.backbones.vggt.packing import pack
@@ -47,6 +48,8 @@ def _parse(argv: list[str]) -> argparse.Namespace:
                         help='what computes the plain step: the same model, one in fp32, or one '
                         'with fp32 weights under bfloat16 autocast, as published')
     parser.add_argument('--device', default='auto')
+    parser.add_argument('--compile', action='store_true', help='have torch compile the model, '
+                        'but for a plain step that another one computes')
     parser.add_argument('--rounds', type=int, default=7, help='each kind of step is timed so '
                         'often (default: %(default)s)')
     arguments = parser.parse_args(argv)
@@ -66,7 +69,7 @@ def _size(text: str) -> tuple[int, int]:
 def _run(argv: list[str]) -> None:
     arguments = _parse(argv)
     device = choose_device(arguments.device)
-    with torch.inference_mode(), memory_bounded(device):
+    with torch.inference_mode(), memory_bounded(device), compiler_needed():
         _compare(arguments, device)
 
 
@@ -75,7 +78,11 @@ def _compare(arguments: argparse.Namespace, device: torch.device) -> None:
     dtype = choose_dtype(arguments.precision, device)
     shape: tuple[int, int, int] = (*arguments.size, arguments.frames)
     model = random_model(device, dtype)
-    ours = Scene(pack(model) if device.type == 'cpu' else model, *shape)
+    if arguments.compile:
+        compile_blocks(model)
+    elif device.type == 'cpu':
+        pack(model)
+    ours = Scene(model, *shape)
     official = arguments.against == 'official'
     plain = ours if arguments.against == 'same' else Scene(
         random_model(device, torch.float32), *shape, autocast=official)

@@ -11,6 +11,7 @@ import numpy as np
 from kfvo_ros.backbones.base import Window
 from kfvo_ros.backbones.vggt.backbone import VggtBackbone
 from kfvo_ros.backbones.vggt.checkpoint import load_model
+from kfvo_ros.backbones.vggt.compiling import compile_blocks, compiler_needed
 from kfvo_ros.backbones.vggt.out_of_memory import memory_bounded
 from kfvo_ros.backbones.vggt.packing import pack
 from kfvo_ros.backbones.vggt.precision import choose_device, choose_dtype
@@ -22,23 +23,27 @@ WARM_UP_SHAPE = (480, 640, 3)
 
 
 def load_backbone(weights: str, revision: str | None, device: str, precision: str,
-                  image_width: int, reuse: bool, window_size: int) -> VggtBackbone:
+                  image_width: int, reuse: bool, window_size: int,
+                  compiled: bool = False) -> VggtBackbone:
     """Return the backbone with its weights on the device; raises KfvoError.
 
-    On a GPU it has placed a window before it is returned: kernels are loaded and tuned then,
-    and no frame waits for them.
+    On a GPU, or `compiled`, it has placed windows before it is returned: kernels are made, loaded
+    and tuned then, and no frame waits for them.
     """
     place = choose_device(device)
     dtype = choose_dtype(precision, place)
     path = locate(weights, revision)
     with memory_bounded(place):
         model = load_model(path, place, dtype)
-        if place.type == 'cpu':
+        if compiled:
+            compile_blocks(model)
+        elif place.type == 'cpu':
             pack(model)
     logging.getLogger(__name__).info('%s on %s, matrices in %s', path, place, dtype)
     backbone = VggtBackbone(model, image_width, reuse)
-    if place.type == 'cuda':
-        warm_up(backbone, window_size)
+    if compiled or place.type == 'cuda':
+        with compiler_needed():
+            warm_up(backbone, window_size)
     return backbone
 
 

@@ -21,7 +21,8 @@ def memory_bounded(device: torch.device) -> Iterator[None]:
     try:
         yield
     except (torch.OutOfMemoryError, MemoryError, RuntimeError) as error:
-        if type(error) is RuntimeError and not any(words in str(error) for words in NO_MEMORY):
+        known = isinstance(error, torch.OutOfMemoryError | MemoryError)
+        if not known and not any(words in str(error) for words in NO_MEMORY):
             raise
         if device.type == 'cuda':
             torch.cuda.empty_cache()
