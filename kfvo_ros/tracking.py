@@ -56,6 +56,11 @@ def common(a: Tracks, b: Tracks) -> tuple[np.ndarray, np.ndarray]:
     return a.pixels[in_a], b.pixels[in_b]
 
 
+def mean_flow(before: np.ndarray, after: np.ndarray) -> float:
+    """Return the mean length of the motion from pixels (M, 2) to pixels, 0 of none [px]."""
+    return float(np.hypot(*(after - before).T).mean()) if len(before) else 0.0
+
+
 class Tracker:
     """Follow corners through the frames of one sequence.
 

@@ -4,10 +4,8 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from kfvo_ros.keyframes.base import DecisionInput, KeyframePolicy
-from kfvo_ros.tracking import common
+from kfvo_ros.tracking import common, mean_flow
 
 MIN_TRACKS = 8
 """With fewer tracks left since the last keyframe their mean motion means nothing: keep."""
@@ -58,8 +56,3 @@ class Survival(KeyframePolicy):
             return True
         survived = len(before) / len(decision.keyframe_tracks)
         return survived < self.share and mean_flow(before, after) >= self.min_flow
-
-
-def mean_flow(before: np.ndarray, after: np.ndarray) -> float:
-    """Return the mean length of the tracks' motion [px]."""
-    return float(np.hypot(*(after - before).T).mean())

@@ -7,8 +7,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from kfvo_ros.keyframes.base import DecisionInput
-from kfvo_ros.keyframes.heuristics import MIN_TRACKS, mean_flow
-from kfvo_ros.tracking import common
+from kfvo_ros.keyframes.heuristics import MIN_TRACKS
+from kfvo_ros.tracking import common, mean_flow
 
 
 @dataclass(frozen=True)

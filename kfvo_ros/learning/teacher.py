@@ -17,7 +17,7 @@ FLOW, SURVIVAL = 'flow', 'track_survival'
 class Teacher:
     """Keeps a frame once the tracks moved far enough, or too few of them are left.
 
-    ``flow`` is their median motion since the last keyframe [px], ``survival`` the share of that
+    ``flow`` is their mean motion since the last keyframe [px], ``survival`` the share of that
     keyframe's tracks which must be left.
     """
 

@@ -8,10 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kfvo_ros import geometry, track_ids
+from kfvo_ros import geometry
 from kfvo_ros.backbones.geometric import kernels
 from kfvo_ros.backbones.geometric.observations import View
 from kfvo_ros.backbones.geometric.window import Solution
+from kfvo_ros.tracking import common, mean_flow
 
 SIGNAL_NAMES = ('track_survival', 'flow', 'parallax', 'gap', 'baseline_to_depth', 'rotation',
                 'inlier_share', 'depth_information')
@@ -23,9 +24,10 @@ class Motion:
 
     Parallax is what the best rotation leaves of the flow: a wrong translation cannot feign it.
 
-    ``survival`` share of the keyframe's tracks still seen; ``flow`` and ``parallax`` (flow
-    after the rotation is taken out), medians [px]; ``window_parallax`` the largest such median
-    against any frame of the window [px]; ``gap`` [input frames].
+    ``survival`` share of the keyframe's tracks still seen; ``flow`` their mean motion [px], for
+    near things are few and count; ``parallax`` (what is left of it after the rotation is taken
+    out) a median [px]; ``window_parallax`` the largest such median against any frame of the
+    window [px]; ``gap`` [input frames].
     """
 
     survival: float
@@ -37,12 +39,11 @@ class Motion:
 
 def measure_motion(solution: Solution, keyframe: View, newest: View, focal: float) -> Motion:
     """Compare the newest frame with the last keyframe and with the whole window."""
-    shared, _ = track_ids.shared(keyframe.tracks.ids, newest.tracks.ids)
+    before, after = common(keyframe.tracks, newest.tracks)
     seen, mask = solution.observations.seen, solution.observations.mask
     rotations = geometry.nearest_rotation(kernels.correlate(seen, mask, solution.anchor))
     parallaxes = focal * kernels.median_shifts(seen, mask, solution.anchor, rotations)
-    flow = focal * kernels.median_shifts(seen, mask, mask.shape[1] - 2, np.eye(3)[None])
-    return Motion(len(shared) / max(len(keyframe.tracks), 1), float(flow[-1]),
+    return Motion(len(before) / max(len(keyframe.tracks), 1), mean_flow(before, after),
                   float(parallaxes[-1]), float(parallaxes.max()), newest.index - keyframe.index)
 
 
