@@ -10,26 +10,30 @@ import numpy as np
 
 from kfvo_ros.keyframes.observation import Layout, indices_of
 
-FLOW, SURVIVAL = 'flow', 'track_survival'
+FLOW, PARALLAX, SURVIVAL = 'flow', 'parallax', 'track_survival'
 
 
 @dataclass(frozen=True)
 class Teacher:
     """Keeps a frame once the tracks moved far enough, or too few of them are left.
 
-    ``flow`` is their mean motion since the last keyframe [px], ``survival`` the share of that
-    keyframe's tracks which must be left.
+    ``flow`` is their mean motion since the last keyframe [px], ``parallax`` the median of what
+    no rotation explains of it [px], ``survival`` the share of that keyframe's tracks which must
+    be left.
     """
 
     flow: float
+    parallax: float
     survival: float
 
     @staticmethod
     def unseen_in(layout: Layout) -> list[str]:
         """Return the names of what a teacher looks at and an observation does not hold."""
-        return [name for name in (FLOW, SURVIVAL) if (name, 1) not in layout]
+        return [name for name in (FLOW, PARALLAX, SURVIVAL) if (name, 1) not in layout]
 
     def decide(self, observations: np.ndarray, layout: Layout) -> np.ndarray:
         """Return 1 where it keeps, else 0, (N,) for observations (N, D) in this layout."""
-        flow, survival = observations[:, indices_of(((FLOW, 1), (SURVIVAL, 1)), layout)].T
-        return ((flow > np.log1p(self.flow)) | (survival < self.survival)).astype(np.int64)
+        seen = indices_of(((FLOW, 1), (PARALLAX, 1), (SURVIVAL, 1)), layout)
+        flow, parallax, survival = observations[:, seen].T
+        return ((flow > np.log1p(self.flow)) | (parallax > np.log1p(self.parallax))
+                | (survival < self.survival)).astype(np.int64)
