@@ -17,7 +17,7 @@ from kfvo_ros.errors import KfvoError
 from kfvo_ros.keyframes.heuristics import Survival
 from kfvo_ros.odometry import KeyframeOdometry
 from kfvo_ros.sequences.synthetic import SyntheticSequence
-from kfvo_ros.tracking import Tracks
+from kfvo_ros.tracking import Tracks, common
 
 
 def window(poses: np.ndarray, seed: int = 0, noise: float = 0.0,
@@ -235,6 +235,10 @@ def test_signals_follow_the_motion():
     slow, fast, turning = told(moving_poses(8, 0.05)), told(moving_poses(8)), told(
         turning_poses(8))
     assert fast['flow'] > slow['flow']
+    before, after = common(*(frame.payload.tracks for frame in window(
+        moving_poses(8), noise=0.2, backbone=backbone).frames[-2:]))
+    assert np.expm1(fast['flow']) == pytest.approx(  # as the policy optical_flow sees it
+        np.linalg.norm(after - before, axis=1).mean())
     assert fast['parallax'] > 2.0 * turning['parallax']
     assert turning['rotation'] == pytest.approx(
         geometry.rotation_angle(turning_poses(2)[1, :3, :3]), rel=0.05)

@@ -14,7 +14,7 @@ import statistics
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 
 import torch
 from torch import nn
@@ -69,7 +69,8 @@ def _size(text: str) -> tuple[int, int]:
 def _run(argv: list[str]) -> None:
     arguments = _parse(argv)
     device = choose_device(arguments.device)
-    with torch.inference_mode(), memory_bounded(device), compiler_needed():
+    with torch.inference_mode(), memory_bounded(device), (
+            compiler_needed() if arguments.compile else nullcontext()):
         _compare(arguments, device)
 
 

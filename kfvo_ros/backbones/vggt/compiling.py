@@ -12,8 +12,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from torch._dynamo.exc import TorchDynamoException
-
 from kfvo_ros.backbones.vggt.layers import Block
 from kfvo_ros.backbones.vggt.model import Vggt
 from kfvo_ros.errors import KfvoError
@@ -34,6 +32,8 @@ def compile_blocks(model: Vggt) -> Vggt:
 @contextmanager
 def compiler_needed() -> Iterator[None]:
     """Turn what torch could not compile into a KfvoError."""
+    # Not above: the compiler takes two seconds to import.
+    from torch._dynamo.exc import TorchDynamoException
     try:
         yield
     except TorchDynamoException as error:

@@ -41,9 +41,11 @@ def load_backbone(weights: str, revision: str | None, device: str, precision: st
             pack(model)
     logging.getLogger(__name__).info('%s on %s, matrices in %s', path, place, dtype)
     backbone = VggtBackbone(model, image_width, reuse)
-    if compiled or place.type == 'cuda':
+    if compiled:
         with compiler_needed():
             warm_up(backbone, window_size)
+    elif place.type == 'cuda':
+        warm_up(backbone, window_size)
     return backbone
 
 
