@@ -37,7 +37,7 @@ class Episode:
                  rail: Rail, reward: Reward) -> None:
         self._drive, self._rail, self._reward = drive, rail, reward
         self._odometry = KeyframeOdometry(backbone, Every(), scale_rule, window_size)
-        self._trail: deque[tuple[Placed, int]] = deque(maxlen=reward.span or 0)
+        self._trail: deque[Placed] = deque(maxlen=reward.span or 0)
         self._next = 0
         self.decision: DecisionInput | None = None
         self.ended = False
@@ -104,7 +104,7 @@ class Episode:
 
     def _commit(self, keep: bool) -> None:
         self._odometry.commit(keep, {})
-        self._trail.append((self._odometry.pending[-1], self._next - 1))
+        self._trail.append(self._odometry.pending[-1])
 
     def _window(self) -> tuple[np.ndarray, np.ndarray]:
         """Return estimated and true poses (S, 4, 4) of the frames in the window."""
@@ -114,6 +114,7 @@ class Episode:
 
     def _recent(self) -> tuple[np.ndarray, np.ndarray]:
         """Return estimated and true poses (S, 4, 4) of the last input frames, as known now."""
-        return (np.stack([placed.keyframe.T_world_camera for placed, _ in self._trail])
-                @ np.stack([placed.T_keyframe_camera for placed, _ in self._trail]),
-                self._drive.T_truth_camera[[index for _, index in self._trail]])
+        # np.stack would take three times as long, at every decision.
+        return (np.array([placed.keyframe.T_world_camera for placed in self._trail])
+                @ np.array([placed.T_keyframe_camera for placed in self._trail]),
+                self._drive.T_truth_camera[self._next - len(self._trail):self._next])
