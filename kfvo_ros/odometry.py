@@ -216,8 +216,7 @@ class KeyframeOdometry:
         self._final.clear()
         return Update(newest.encoded.stamp_ns, newest.T_world_camera, self._covariance,
                       self._window_covariance, self._status, keep, final,
-                      self._known.points, durations,
-                      self._intrinsics, self._parts)
+                      self._known.points, durations, self._intrinsics, self._parts)
 
     def finish(self) -> tuple[Placed, ...]:
         """Return the frames whose poses were not final yet; they are now."""

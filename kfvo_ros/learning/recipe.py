@@ -67,7 +67,7 @@ class Recipe:
     alpha: float = key(least=-1.0, most=1.0)
     scale: str | None = key(choices=SCALE_RULES)
     teacher: Teacher | None = key(within={'flow': (0.0, 1e3), 'parallax': (0.0, 1e3),
-                                              'survival': (0.0, 1.0)})
+                                          'survival': (0.0, 1.0)})
     rail: Rail | None = key(within={'min_survival': (0.0, 1.0), 'max_gap': (1, None),
                                     'min_flow': (0.0, 1e3)})
     without: tuple[str, ...] = key()

@@ -15,11 +15,11 @@ FLOW, PARALLAX, SURVIVAL = 'flow', 'parallax', 'track_survival'
 
 @dataclass(frozen=True)
 class Teacher:
-    """Keeps a frame once the tracks moved far enough, or too few of them are left.
+    """Keeps a frame after enough flow or parallax, or when too few of the tracks are left.
 
-    ``flow`` is their mean motion since the last keyframe [px], ``parallax`` the median of what
-    no rotation explains of it [px], ``survival`` the share of that keyframe's tracks which must
-    be left.
+    ``flow`` is the tracks' mean motion since the last keyframe [px], ``parallax`` the median of
+    what no rotation explains of it [px], ``survival`` the share of that keyframe's tracks which
+    must be left.
     """
 
     flow: float
