@@ -64,19 +64,30 @@ def test_noisy_tracks_tell_as_much_as_they_claim():
 
 def test_each_answer_adds_to_what_is_known():
     window = solved(3, (0.0, 0.005), 0.3)
-    first = Lens().told(window.problem, window.state, window.noise, 7)
-    second = first.told(window.problem, window.state, window.noise, 15)
+    first = Lens().told(window.problem, window.state, window.noise, range(8))
+    second = first.told(window.problem, window.state, window.noise, range(8, 16))
     assert 0.0 < first.errors[1] < 0.005
     assert (first.asked, second.asked) == (7, 15)
     variances = [np.linalg.inv(lens.information)[1, 1] for lens in (first, second)]
     assert EXPECTED ** 2 > variances[0] > variances[1]
 
 
+def test_frames_far_apart_say_more_than_successive_ones():
+    window = solved(3, (0.0, 0.005), 0.3)
+    near, far = (Lens().told(window.problem, window.state, window.noise, range(0, 8 * gap, gap))
+                 for gap in (1, 4))
+    assert np.linalg.eigvalsh(far.information - near.information).min() > 0.0
+    assert abs(far.errors[1] - 0.005) < abs(near.errors[1] - 0.005)
+    independent, _ = marginal(window.problem, window.state)
+    assert np.linalg.eigvalsh(
+        independent / window.noise ** 2 + Lens().information - far.information).min() > 0.0
+
+
 def test_a_window_without_parallax_tells_nothing_of_the_focal_length():
     cloud = PointCloud(0, noise=0.3)
     views = [cloud.encode(index, np.eye(4)).payload for index in range(8)]
     window = solve(tabulate(views, 0, Lens()), Initialiser(CAMERA.fx, 0), None, History())
-    lens = Lens().told(window.problem, window.state, window.noise, 7)
+    lens = Lens().told(window.problem, window.state, window.noise, range(8))
     assert np.isfinite(lens.errors).all()
     assert (np.abs(lens.errors) < EXPECTED).all()
 

@@ -118,7 +118,8 @@ def _lens(memory: Memory, solution: Solution, views: tuple[View, ...], camera: C
     if not (memory.certain and solution.measured and views[0].index >= memory.lens.asked
             and camera.readout_s == 0.0):
         return memory.lens
-    return memory.lens.told(solution.problem, solution.state, solution.noise, views[-1].index)
+    return memory.lens.told(solution.problem, solution.state, solution.noise,
+                            [view.index for view in views])
 
 
 def _describe(grey: np.ndarray) -> np.ndarray:

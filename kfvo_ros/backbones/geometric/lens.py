@@ -11,6 +11,7 @@ filter of something that does not move.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -22,9 +23,9 @@ from kfvo_ros.backbones.geometric.schur import reduce
 EXPECTED = 0.005
 """One standard deviation of a calibration's error: by this share points lie elsewhere, near the
 axis and, in addition, at 45 degrees off it."""
-REPEATED = 6.0
-"""A window says less than so many tracks with independent errors would: a track's errors are
-alike from frame to frame, and keyframes are asked again as part of the history."""
+ALIKE = 0.7
+"""How a track's errors in two successive frames correlate; g frames apart it is ALIKE^g. Errors
+that are alike say less than independent ones would, more so where every frame is a keyframe."""
 
 
 def _calibrated() -> np.ndarray:
@@ -47,15 +48,16 @@ class Lens:
         """Return where points (N, 2) lie, normalised as they are."""
         return points / (1.0 + _basis(points) @ self.errors)[:, None]
 
-    def told(self, problem: Problem, state: State, noise: float, newest: int) -> Lens:
+    def told(self, problem: Problem, state: State, noise: float, indices: Sequence[int]) -> Lens:
         """Return what is known after a window, straightened by this lens, has been solved.
 
-        Its tracks are off by `noise` [px]; `newest` is the index of its newest view.
+        Its tracks are off by `noise` [px]; `indices` are those of its frames.
         """
         information, pull = marginal(problem, state)
-        variance = REPEATED * noise ** 2
+        correlation = ALIKE ** ((indices[-1] - indices[0]) / (len(indices) - 1))
+        variance = noise ** 2 * (1.0 + correlation) / (1.0 - correlation)
         known = self.information + information / variance
-        return Lens(self.errors + np.linalg.solve(known, pull / variance), known, newest)
+        return Lens(self.errors + np.linalg.solve(known, pull / variance), known, indices[-1])
 
 
 def _basis(points: np.ndarray) -> np.ndarray:
