@@ -167,7 +167,7 @@ def _report(plan: Plan, runs: Sequence[Run], rows: Sequence[Row], examiner: Exam
 def _parse(argv: list[str]) -> argparse.Namespace:
     parser = make_parser('kfvo_benchmark', __doc__ or '', EXAMPLES)
     parser.add_argument('sequence', nargs='+', help='dataset folders or bags, or '
-                        'synthetic:A-B[:smooth|fast|mixed]')
+                        'synthetic:A-B[:smooth|fast|mixed|street]')
     parser.add_argument('--output', required=True, help='folder for results.csv, results.md, '
                         'results.tex, results.html and the pictures; the files of each run come '
                         'into its runs/SEQUENCE/METHOD/SEED')

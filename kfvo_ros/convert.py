@@ -62,7 +62,7 @@ def _parse(argv: list[str]) -> argparse.Namespace:
     parser = make_parser(
         'kfvo_convert', 'Write any sequence as a bag that "ros2 bag play" plays.', EXAMPLES)
     parser.add_argument('sequence', help='dataset folder, ROS 1 or 2 bag, folder of images, '
-                        'video, or synthetic:SEED[:smooth|fast|mixed]')
+                        'video, or synthetic:SEED[:smooth|fast|mixed|street]')
     parser.add_argument('bag', help='folder to create; an existing one is never touched')
     parser.add_argument('--topic', help='topic of the images (default: that of the bag they come '
                         'from, else /camera/image_raw)')

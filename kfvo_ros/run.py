@@ -59,7 +59,7 @@ def _parse(argv: list[str]) -> argparse.Namespace:
     from kfvo_ros.options import OdometryOptions, SequenceOptions, VggtOptions, add_arguments
     parser = make_parser('kfvo_run', 'Visual odometry over every frame of a sequence.', EXAMPLES)
     parser.add_argument('sequence', help='dataset folder, bag, folder of images, video, or '
-                        'synthetic:SEED[:smooth|fast|mixed]')
+                        'synthetic:SEED[:smooth|fast|mixed|street]')
     parser.add_argument('--output', required=True, help='folder for trajectory.tum, '
                         'keyframes.tum and summary.json')
     parser.add_argument('--overwrite', action='store_true', help='replace earlier results')

@@ -185,7 +185,7 @@ def _parse(argv: list[str]) -> argparse.Namespace:
     parser = make_parser('kfvo_train', 'Learn which frames to keep: PPO of a keyframe policy.',
                          EXAMPLES)
     parser.add_argument('sequence', nargs='*', help='dataset folders or bags with ground truth, '
-                        'or synthetic:A-B[:smooth|fast|mixed]')
+                        'or synthetic:A-B[:smooth|fast|mixed|street]')
     parser.add_argument('--output', required=True, help='the policy (.safetensors); checkpoint '
                         'and logs come into the .training folder beside it')
     parser.add_argument('--validation', nargs='+', default=(), metavar='SEQUENCE',

@@ -14,7 +14,8 @@ from kfvo_ros.errors import KfvoError
 from kfvo_ros.sequences.synthetic import SyntheticSequence, parse_synthetic
 from kfvo_ros.tracking import Tracker, common
 
-CHECKSUMS = {(0, 'smooth'): 0x8502720a, (1, 'fast'): 0xaf7b44c2, (7, 'mixed'): 0x5b5b70fb}
+CHECKSUMS = {(0, 'smooth'): 0x8502720a, (1, 'fast'): 0xaf7b44c2, (7, 'mixed'): 0x5b5b70fb,
+             (2, 'street'): 0x6becd4e2}
 """CRC-32 of frames 0, 7 and 60 at 320x240: a change of one byte changes every result."""
 
 
@@ -36,11 +37,12 @@ def test_frames_do_not_depend_on_the_order_or_the_length():
                                   short.ground_truth().trajectory.poses)
 
 
-def test_stamps_are_thirty_a_second_and_match_the_truth():
-    sequence = SyntheticSequence(0, 'smooth', 31, 64, 48)
+@pytest.mark.parametrize(('style', 'rate'), [('smooth', 30), ('street', 10)])
+def test_stamps_are_so_many_a_second_and_match_the_truth(style, rate):
+    sequence = SyntheticSequence(0, style, 31, 64, 48)
     stamps = np.array([frame.stamp_ns for frame in sequence])
     np.testing.assert_array_equal(stamps, sequence.ground_truth().trajectory.stamps_ns)
-    assert stamps[30] - stamps[0] == 1_000_000_000
+    assert stamps[rate] - stamps[0] == 1_000_000_000
     assert sequence.length == 31 and sequence.ground_truth().frame == 'camera'
 
 
@@ -102,12 +104,30 @@ def test_pure_rotation_is_short():
             assert np.degrees(turned) <= 40.0
 
 
-@pytest.mark.parametrize('style', ['smooth', 'fast', 'mixed'])
-def test_difficulty_of_seeds_0_to_9(style):
+@pytest.mark.parametrize(('style', 'least_life'), [
+    ('smooth', 4.0), ('fast', 4.0), ('mixed', 4.0), ('street', 3.0)])
+def test_difficulty_of_seeds_0_to_9(style, least_life):
     """Mean flow of 5 to 25 px a frame and tracks that live 4 to 15 frames: no easy pictures."""
     flows, lives = zip(*(_measure(seed, style) for seed in range(10)), strict=True)
     assert 5.0 < np.mean(flows) < 25.0, flows
-    assert 4.0 < np.mean(lives) < 15.0, lives
+    assert least_life < np.mean(lives) < 15.0, lives
+
+
+def test_a_street_is_driven_as_a_car_can():
+    """It looks ahead, stops and goes, and takes corners at up to 60 degrees a second."""
+    for seed in range(10):
+        sequence = SyntheticSequence(seed, 'street')
+        poses = sequence.ground_truth().trajectory.poses
+        steps = np.diff(poses[:, :3, 3], axis=0)
+        lengths = np.linalg.norm(steps, axis=1)
+        assert 80.0 < lengths.sum() < 200.0 and lengths.max() < 1.5
+        moving = lengths > 0.1
+        ahead = (steps * poses[:-1, :3, 2]).sum(axis=1)[moving] / lengths[moving]
+        assert ahead.min() > np.cos(np.radians(6.0))
+        turn = geometry.rotation_angle(geometry.relative(poses[:-1], poses[1:])[:, :3, :3])
+        assert np.degrees(turn).max() < 6.0
+        assert abs(poses[:, 2, 3] - 1.65).max() < 0.01
+        assert sequence.depth(0).min() > 1.0 and 20.0 < sequence.depth(0).max() < 500.0
 
 
 def test_mixed_seeds_defeat_who_searches_where_points_were(tmp_path, monkeypatch):

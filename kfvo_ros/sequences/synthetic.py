@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Rendered sequences, ``synthetic:SEED[:smooth|fast|mixed]``: exact poses without a file."""
+"""Rendered sequences, ``synthetic:SEED[:STYLE]``: exact poses without a file."""
 
 from __future__ import annotations
 
@@ -16,13 +16,14 @@ from kfvo_ros.errors import KfvoError
 from kfvo_ros.sequences.base import Frame, GroundTruth, Sequence
 from kfvo_ros.sequences.exposure import expose
 from kfvo_ros.sequences.rendering import Scene, render
-from kfvo_ros.sequences.synthetic_motion import RATE, Waves, move
-from kfvo_ros.sequences.synthetic_path import Path
+from kfvo_ros.sequences.synthetic_motion import Waves, move, rate_of
+from kfvo_ros.sequences.synthetic_path import Path, around_block, around_room
 from kfvo_ros.sequences.synthetic_random import Dice
+from kfvo_ros.sequences.synthetic_street import build_street
 from kfvo_ros.sequences.synthetic_world import build_scene
 from kfvo_ros.trajectory import NANOSECONDS, Trajectory
 
-STYLES = ('smooth', 'fast', 'mixed')
+STYLES = ('smooth', 'fast', 'mixed', 'street')
 MAX_SEED = 2 ** 32 - 1
 START_NS = NANOSECONDS
 """The first stamp; ROS takes zero for no time at all."""
@@ -32,13 +33,14 @@ GAIN_DRIFT, GAIN_BANDS = 0.05, ((0.05, 0.1), (0.1, 0.2), (0.2, 0.4))
 
 
 class SyntheticSequence(Sequence):
-    """A hand-held camera in a rendered room, 30 Hz, grey; every frame is rendered when asked for.
+    """A rendered room or street, grey; every frame is rendered when asked for.
 
-    ``smooth`` and ``fast`` are kind to an odometry. ``mixed`` also hovers, creeps and turns on
-    the spot, and with odd seeds it throws the camera about in a bare room. World z is up and
-    the first pose is not the identity. The same arguments give the same bytes on every machine;
-    a longer sequence starts with the frames of a shorter one. Raises KfvoError for arguments
-    out of range.
+    In a room the camera is hand-held, 30 Hz: ``smooth`` and ``fast`` are kind to an odometry;
+    ``mixed`` also hovers, creeps and turns on the spot, and with odd seeds it throws the camera
+    about in a bare room. In a ``street`` a car carries it, 10 Hz: it drives, hurries, crawls,
+    stops and goes around corners. World z is up and the first pose is not the identity. The same
+    arguments give the same bytes on every machine; a longer sequence starts with the frames of a
+    shorter one. Raises KfvoError for arguments out of range.
     """
 
     def __init__(self, seed: int, style: str = 'mixed', frame_count: int = 200,
@@ -71,7 +73,7 @@ class SyntheticSequence(Sequence):
         radiance, _ = render(self._scene, self.camera, self._poses[index])
         gain = 1.0 + GAIN_DRIFT * self._gain.at(index)
         image = expose(radiance, gain, noise_key=self._seed << 32 | index)
-        return Frame(_stamp_ns(index), image, self.camera)
+        return Frame(self._stamp_ns(index), image, self.camera)
 
     def depth(self, index: int) -> np.ndarray:
         """Return a frame's depth (H, W) along the optical axis [m]; raises IndexError."""
@@ -79,7 +81,8 @@ class SyntheticSequence(Sequence):
 
     def ground_truth(self) -> GroundTruth:
         """Return the poses, T_world_camera, that the frames were rendered with."""
-        stamps_ns = np.array([_stamp_ns(index) for index in range(self._length)], dtype=np.int64)
+        stamps_ns = np.array([self._stamp_ns(index) for index in range(self._length)],
+                             dtype=np.int64)
         return GroundTruth(Trajectory(stamps_ns, self._poses))
 
     @cached_property
@@ -89,21 +92,29 @@ class SyntheticSequence(Sequence):
 
     @cached_property
     def _scene(self) -> Scene:
+        if self._temper == 'street':
+            return build_street(self._dice('scene'), self._path)
         return build_scene(self._dice('scene'), self._temper, self._room_size,
                            self._path.positions(600))
 
     @cached_property
     def _gain(self) -> Waves:
-        return Waves(self._dice('gain'), *GAIN_BANDS)
+        return Waves(self._dice('gain'), rate_of(self._temper), *GAIN_BANDS)
 
     @property
     def _path(self) -> Path:
-        return Path(self._dice('path'), self._room_size)
+        dice = self._dice('path')
+        if self._temper == 'street':
+            return around_block(dice)
+        return around_room(dice, self._room_size)
 
     @property
     def _room_size(self) -> tuple[float, float, float]:
         dice = self._dice('room')
         return dice.between(6.5, 9.5), dice.between(6.0, 8.0), dice.between(2.6, 3.2)
+
+    def _stamp_ns(self, index: int) -> int:
+        return START_NS + index * NANOSECONDS // rate_of(self._temper)
 
     def _dice(self, purpose: str) -> Dice:
         purposes = ('room', 'path', 'motion', 'scene', 'gain')
@@ -117,7 +128,3 @@ def parse_synthetic(text: str) -> SyntheticSequence:
         raise KfvoError('expected synthetic:SEED or synthetic:SEED:STYLE, as in '
                         f'synthetic:7:fast, came {text!r}')
     return SyntheticSequence(int(match[1]), match[2] or 'mixed')
-
-
-def _stamp_ns(index: int) -> int:
-    return START_NS + index * NANOSECONDS // RATE

@@ -23,10 +23,10 @@ SHADES_INSIDE = (0.95, 0.88, 0.92, 1.00, 0.90, 1.00)
 
 
 class BoxCollector:
-    """Collects upright boxes, the room first, and the textures that they wear."""
+    """Collects upright boxes, the room or the world first, and the textures that they wear."""
 
-    def __init__(self, dice: Dice) -> None:
-        self._dice = dice
+    def __init__(self, dice: Dice, texels_per_metre: float = TEXELS_PER_METRE) -> None:
+        self._dice, self._texels_per_metre = dice, texels_per_metre
         self._turns: list[Turn] = []
         self._centres: list[Size] = []
         self._halves: list[Size] = []
@@ -49,7 +49,8 @@ class BoxCollector:
             across, down = ((1, 2), (0, 2), (0, 1))[side // 2]
             for axis, scale, offset in ((across, 'scale_u', 'offset_u'),
                                         (down, 'scale_v', 'offset_v')):
-                face[scale] = TEXTURE_SIZE / size[axis] if fitted else TEXELS_PER_METRE
+                face[scale] = (TEXTURE_SIZE / size[axis] if fitted
+                               else self._texels_per_metre)
                 face[offset] = (0.5 * TEXTURE_SIZE if fitted
                                 else self._dice.integer(0, TEXTURE_SIZE))
             self.paint(len(self._faces) - 1, side, texture, contrast, tone)

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """How the camera of a rendered sequence moves: a changing pace, a roaming gaze, a shaking hand.
 
+Or a car: then it looks ahead.
+
 Poses do not depend on how many are asked for and are the same for ever.
 """
 
@@ -14,17 +16,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from kfvo_ros.geometry import make_transform
-from kfvo_ros.sequences.synthetic_path import KNOTS, Path, rounded
+from kfvo_ros.sequences.synthetic_path import Path, rounded
 from kfvo_ros.sequences.synthetic_random import Dice
 
-RATE = 30
-"""Frames per second."""
+RATE, RATES = 30, {'street': 10}
+"""Frames per second, and of the tempers that have another rate."""
 MAX_GAZE = math.radians(65.0)
 """The camera looks at most so far to the side of where it goes."""
 PITCHES, ROLLS = (-14.0, 4.0), (-6.0, 6.0)
 """How it is held [deg]."""
 PACE_RESPONSE = 0.25
-"""Share of the way to a new speed that each of a Follower's stages covers per frame."""
+"""Share of the way to a new speed that each of a Follower's stages covers per frame, on foot."""
 TREMBLE_BANDS = ((0.5, 1.0), (1.0, 2.0), (2.0, 4.0))
 TREMBLE_POSITION, TREMBLE_ANGLE = 0.001, math.radians(0.08)
 """A hand shakes along and about every axis by one sine per band [Hz] of this amplitude."""
@@ -35,8 +37,9 @@ class Activity:
     """What the camera does for a while.
 
     Ranges of how many ``seconds`` it takes, of the ``speed`` [m/s] and of the ``gaze`` [deg],
-    the angle of view with the path; ``response`` as PACE_RESPONSE, of the gaze. An activity
-    that ``swings`` looks to the other side than before; one that ``turns`` adds to the gaze.
+    the angle of view with the path; ``response`` as PACE_RESPONSE, of the gaze, and ``pace``, of
+    the speed. An activity that ``swings`` looks to the other side than before; one that ``turns``
+    adds to the gaze.
     """
 
     seconds: tuple[float, float]
@@ -45,6 +48,7 @@ class Activity:
     response: float
     swings: bool = False
     turns: bool = False
+    pace: float = PACE_RESPONSE
 
 
 CRUISE = Activity((0.8, 1.5), (1.2, 1.8), (5.0, 40.0), 0.12)
@@ -54,11 +58,16 @@ DASH = Activity((0.5, 0.9), (1.4, 2.2), (40.0, 60.0), 0.40, swings=True)
 CREEP = Activity((0.6, 0.9), (0.2, 0.35), (0.0, 15.0), 0.10)
 HOVER = Activity((0.5, 0.8), (0.0, 0.0), (0.0, 0.0), 0.30, turns=True)
 TURN = Activity((0.8, 1.1), (0.0, 0.0), (20.0, 34.0), 0.18, turns=True)
+DRIVE = Activity((2.0, 4.0), (6.0, 10.0), (0.0, 0.0), 0.25, turns=True, pace=0.15)
+HURRY = Activity((2.0, 4.0), (10.0, 14.0), (0.0, 0.0), 0.25, turns=True, pace=0.15)
+CRAWL = Activity((1.0, 2.0), (2.0, 4.0), (0.0, 0.0), 0.25, turns=True, pace=0.15)
+STOP = Activity((2.0, 3.0), (0.0, 0.0), (0.0, 0.0), 0.25, turns=True, pace=0.25)
 
 DECKS = {'smooth': ((CRUISE,),),
          'fast': ((RUSH,), (RUSH,), (WALK,)),
          'mixed': ((WALK, RUSH), (RUSH,), (CREEP,), (HOVER, TURN, WALK)),
-         'hectic': ((WALK, DASH), (DASH, DASH), (DASH,), (CREEP,), (HOVER, TURN, WALK))}
+         'hectic': ((WALK, DASH), (DASH, DASH), (DASH,), (CREEP,), (HOVER, TURN, WALK)),
+         'street': ((DRIVE,), (DRIVE, HURRY), (DRIVE,), (CRAWL,), (STOP, DRIVE))}
 """By temper: the first group comes first, then all groups, shuffled, again and again."""
 
 Targets = tuple[float, float, float, float]
@@ -67,10 +76,11 @@ Targets = tuple[float, float, float, float]
 
 def move(dice: Dice, temper: str, path: Path) -> Iterator[np.ndarray]:
     """Yield T_world_camera (4, 4), frame by frame, without end."""
-    trembles = [Waves(dice, *TREMBLE_BANDS) for _ in range(6)]
-    place = dice.between(0.0, KNOTS)
+    rate = rate_of(temper)
+    trembles = [Waves(dice, rate, *TREMBLE_BANDS) for _ in range(6)]
+    place = dice.between(0.0, len(path))
     followers: list[Follower] = []
-    for frame, (targets, response) in enumerate(_plan(dice, temper)):
+    for frame, (targets, responses) in enumerate(_plan(dice, temper)):
         followers = followers or [Follower(target) for target in targets]
         speed, yaw, pitch, roll = (follower.value for follower in followers)
         position, derivative = path.at(place)
@@ -78,15 +88,18 @@ def move(dice: Dice, temper: str, path: Path) -> Iterator[np.ndarray]:
         yield _pose([position[axis] + TREMBLE_POSITION * shake[axis] for axis in range(3)],
                     math.atan2(derivative[1], derivative[0]) + yaw + TREMBLE_ANGLE * shake[3],
                     pitch + TREMBLE_ANGLE * shake[4], roll + TREMBLE_ANGLE * shake[5])
-        place += speed / (RATE * math.sqrt(sum(value * value for value in derivative)))
-        for follower, target, share in zip(followers, targets,
-                                           (PACE_RESPONSE, response, response, response),
-                                           strict=True):
+        place += speed / (rate * math.sqrt(sum(value * value for value in derivative)))
+        for follower, target, share in zip(followers, targets, responses, strict=True):
             follower.step(target, share)
 
 
-def _plan(dice: Dice, temper: str) -> Iterator[tuple[Targets, float]]:
-    """Yield, per frame, what to aim at and the gaze's response."""
+def rate_of(temper: str) -> int:
+    """Return the frames per second."""
+    return RATES.get(temper, RATE)
+
+
+def _plan(dice: Dice, temper: str) -> Iterator[tuple[Targets, Targets]]:
+    """Yield, per frame, what to aim at and the share of the way to it that a stage covers."""
     yaw = pitch = roll = 0.0
     groups = list(DECKS[temper][:1])
     while True:
@@ -100,8 +113,10 @@ def _plan(dice: Dice, temper: str) -> Iterator[tuple[Targets, float]]:
             else:
                 yaw = gaze
                 pitch, roll = (math.radians(dice.between(*limits)) for limits in (PITCHES, ROLLS))
-            for _ in range(round(RATE * dice.between(*activity.seconds))):
-                yield (speed, yaw, pitch, roll), activity.response
+            gazing = activity.response
+            responses = activity.pace, gazing, gazing, gazing
+            for _ in range(round(rate_of(temper) * dice.between(*activity.seconds))):
+                yield (speed, yaw, pitch, roll), responses
         groups = dice.shuffled(DECKS[temper])
 
 
@@ -125,8 +140,8 @@ class Follower:
 class Waves:
     """A sum of sines of amplitude one, one in each band [Hz]."""
 
-    def __init__(self, dice: Dice, *bands: tuple[float, float]) -> None:
-        self._waves = [(2.0 * math.pi * dice.between(*band) / RATE,
+    def __init__(self, dice: Dice, rate: float, *bands: tuple[float, float]) -> None:
+        self._waves = [(2.0 * math.pi * dice.between(*band) / rate,
                         dice.between(0.0, 2.0 * math.pi)) for band in bands]
 
     def at(self, frame: int) -> float:

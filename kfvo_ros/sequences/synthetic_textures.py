@@ -220,3 +220,28 @@ def cardboard(dice: Dice) -> np.ndarray:
     side[stamp_row + 10:stamp_row + 50, stamp_column + 10:stamp_column + 80] = 130.0
     side[:4] = side[:, :4] = 60.0
     return side
+
+
+def facade(dice: Dice) -> np.ndarray:
+    """Return the front of a house: rows of windows, a door, a roof's edge."""
+    front = np.full((SIZE, SIZE), dice.between(110.0, 190.0)) + 6.0 * fractal(dice, 8, 256, 0.8)
+    rows, columns = dice.integer(2, 4), dice.integer(3, 6)
+    high, wide = (SIZE - 40) // rows, SIZE // columns
+    frame, door = dice.between(60.0, 230.0), dice.integer(0, columns)
+    for row in range(rows):
+        for column in range(columns):
+            top, left = 40 + row * high + high // 5, column * wide + wide // 4
+            bottom, right = top + 3 * high // 5, left + wide // 2
+            if row == rows - 1 and column == door:
+                bottom = SIZE
+            front[top - 5:bottom + 5, left - 5:right + 5] = frame
+            front[top:bottom, left:right] = dice.between(30.0, 110.0)
+            front[top:bottom, (left + right) // 2 - 2:(left + right) // 2 + 2] = frame
+            front[top + (bottom - top) // 3:top + (bottom - top) // 3 + 4, left:right] = frame
+    front[:24] = dice.between(40.0, 100.0)
+    return front
+
+
+def leaves(dice: Dice) -> np.ndarray:
+    """Return a hedge, or a tree's crown: dark and light at every scale."""
+    return 95.0 + 30.0 * fractal(dice, 4, 128, 0.85)
