@@ -167,6 +167,19 @@ class Camera:
                        fy=self.fy * factor, cx=(self.cx + 0.5) * factor - 0.5,
                        cy=(self.cy + 0.5) * factor - 0.5)
 
+    def miscalibrated(self, focal: float, radial: float) -> Camera:
+        """Return what somebody might have measured instead, off by a share of the focal length.
+
+        By the other share, the first coefficient of the lens, it is off one focal length from
+        the axis.
+        """
+        model, coefficients = self.distortion_model, self.distortion
+        if model == 'none':
+            model, coefficients = 'plumb_bob', (0.0,) * 5
+        return replace(self, fx=self.fx * (1.0 + focal), fy=self.fy * (1.0 + focal),
+                       distortion_model=model,
+                       distortion=(coefficients[0] + radial, *coefficients[1:]))
+
     def cropped(self, x: int, y: int, width: int, height: int) -> Camera:
         """Return the camera of a region of the image whose first pixel is (x, y)."""
         return replace(self, width=width, height=height, cx=self.cx - x, cy=self.cy - y)

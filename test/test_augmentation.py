@@ -16,7 +16,8 @@ from kfvo_ros.sequences.base import Frame, Sequence
 from kfvo_ros.sequences.synthetic import SyntheticSequence
 
 FRAMES = 40
-SAME = Augmentation(0.0, 0.0, 0.0, drop_share=0.0, max_stride=1, reversal=False, frames=FRAMES)
+SAME = Augmentation(0.0, 0.0, 0.0, 0.0, drop_share=0.0, max_stride=1, reversal=False,
+                    frames=FRAMES)
 COLOURS = np.random.default_rng(0).integers(0, 256, (12, 10, 3), dtype=np.uint8)
 
 
@@ -70,6 +71,23 @@ def test_light_stays_within_its_range():
              for variant in variants(replace(SAME, brightness=0.25))]
     bright = next(iter(sequence())).image.mean()
     assert 0.74 * bright < min(means) < 0.9 * bright < 1.1 * bright < max(means) < 1.26 * bright
+
+
+def test_calibrations_are_off_by_as_much_as_allowed():
+    true, believed = sequence().camera, [
+        variant.camera for variant in variants(replace(SAME, calibration=0.02))]
+    assert believed == [next(iter(variant)).camera
+                        for variant in variants(replace(SAME, calibration=0.02))]
+    focal = np.array([camera.fx / true.fx - 1.0 for camera in believed])
+    radial = np.array([camera.distortion[0] for camera in believed])
+    for off in (focal, radial):
+        assert -0.02 < off.min() < -0.01 and 0.01 < off.max() < 0.02
+    assert abs(np.corrcoef(focal, radial)[0, 1]) < 0.6
+    pixel = np.array([[true.cx + true.fx, true.cy]])
+    for camera, share, bend in zip(believed, focal, radial, strict=True):
+        assert camera.fy / camera.fx == true.fy / true.fx
+        assert camera.undistort(pixel)[0, 0] == pytest.approx(1.0 - share - bend, abs=4e-3)
+    assert variants(SAME)[0].camera.undistort(pixel) == pytest.approx(true.undistort(pixel))
 
 
 def test_frames_are_dropped_by_chance_up_to_a_share():

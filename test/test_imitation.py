@@ -24,7 +24,7 @@ from kfvo_ros.learning.teacher import Teacher
 from kfvo_ros.learning.training import make_model
 from kfvo_ros.options import OdometryOptions, SequenceOptions, VggtOptions
 
-TEACHER = Teacher(flow=12.0, parallax=5.0, survival=0.6)
+TEACHER = Teacher(flow=12.0, baseline=0.04, survival=0.6)
 
 
 def choices(**changes) -> Choices:
@@ -56,16 +56,16 @@ def test_the_actor_decides_as_its_teacher_did_and_the_critic_knows_what_it_is_wo
     assert ((values - returns) ** 2).mean() < 0.25 * (returns ** 2).mean()
 
 
-def test_the_teacher_keeps_after_enough_flow_or_parallax_and_when_tracks_are_lost():
-    layout = (('poses', 2), ('track_survival', 1), ('parallax', 1), ('flow', 1))
-    seen = np.array([[9.0, 9.0, 0.9, np.log1p(parallax), np.log1p(flow)]
-                     for flow, parallax in ((0.0, 0.0), (11.9, 4.9), (12.1, 0.0), (0.0, 5.1))]
+def test_the_teacher_keeps_after_enough_flow_or_baseline_and_when_tracks_are_lost():
+    layout = (('poses', 2), ('track_survival', 1), ('baseline_to_depth', 1), ('flow', 1))
+    seen = np.array([[9.0, 9.0, 0.9, baseline, np.log1p(flow)]
+                     for flow, baseline in ((0.0, 0.0), (11.9, 0.039), (12.1, 0.0), (0.0, 0.041))]
                     + [[0.0, 0.0, 0.59, 0.0, 0.0]])
     assert TEACHER.decide(seen, layout).tolist() == [0, 0, 1, 1, 1]
 
 
 def test_without_what_the_teacher_looks_at_nobody_can_be_imitated():
-    for without, missing in ((('signals',), 'flow and parallax and track_survival'),
+    for without, missing in ((('signals',), 'flow and baseline_to_depth and track_survival'),
                              (('track_survival',), 'track_survival')):
         with pytest.raises(KfvoError, match=f'teacher: .* does not observe {missing}$'):
             choices(without=without).plan(['synthetic:1'], [], GeometricBackbone())

@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Sequences as they might have been recorded: another light, another pace, the other way round."""
+"""Sequences as they might have been recorded: another light, pace, direction or calibration."""
 
 from __future__ import annotations
 
@@ -20,14 +20,16 @@ class Augmentation:
     """How far variants of a sequence may go from it.
 
     ``brightness``, ``contrast`` and ``saturation`` of a variant are factors within 1 +- these;
-    a frame is left out with a probability of up to ``drop_share``; of the others every k-th is
-    taken, k up to ``max_stride``, and with ``reversal`` one variant in two runs backwards. A
-    variant has ``frames`` at most, from anywhere. Source: the paper, section IV-E.
+    its focal length and its lens are believed to be off by up to ``calibration``; a frame is left
+    out with a probability of up to ``drop_share``; of the others every k-th is taken, k up to
+    ``max_stride``, and with ``reversal`` one variant in two runs backwards. A variant has
+    ``frames`` at most, from anywhere. Source, but for the calibration: the paper, section IV-E.
     """
 
     brightness: float = 0.4
     contrast: float = 0.4
     saturation: float = 0.4
+    calibration: float = 0.01
     drop_share: float = 0.1
     max_stride: int = 2
     reversal: bool = True
@@ -43,7 +45,9 @@ class Variant(Sequence):
         self._rng_seed = (number, zlib.crc32(sequence.name.encode()))
         dice = np.random.default_rng(self._rng_seed)
         self.name = f'{sequence.name} variant {number}'
-        self.camera = sequence.camera
+        self.camera = sequence.camera and sequence.camera.miscalibrated(
+            *np.random.default_rng((*self._rng_seed, 2)).uniform(
+                -augmentation.calibration, augmentation.calibration, 2))
         self._factors = [dice.uniform(1.0 - reach, 1.0 + reach) for reach in (
             augmentation.brightness, augmentation.contrast, augmentation.saturation)]
         self._drop_share = dice.uniform(0.0, augmentation.drop_share)
@@ -66,7 +70,7 @@ class Variant(Sequence):
             frames = (replace(frame, stamp_ns=mirror - frame.stamp_ns)
                       for frame in reversed(list(frames)))
         for frame in frames:
-            yield replace(frame, image=jitter(frame.image, *self._factors))
+            yield replace(frame, image=jitter(frame.image, *self._factors), camera=self.camera)
 
     @property
     def length(self) -> None:

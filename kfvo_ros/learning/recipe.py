@@ -66,7 +66,7 @@ class Recipe:
     span: int = key(least=40, most=1000)
     alpha: float = key(least=-1.0, most=1.0)
     scale: str | None = key(choices=SCALE_RULES)
-    teacher: Teacher | None = key(within={'flow': (0.0, 1e3), 'parallax': (0.0, 1e3),
+    teacher: Teacher | None = key(within={'flow': (0.0, 1e3), 'baseline': (0.0, 1e3),
                                           'survival': (0.0, 1.0)})
     rail: Rail | None = key(within={'min_survival': (0.0, 1.0), 'max_gap': (1, None),
                                     'min_flow': (0.0, 1e3)})
@@ -75,7 +75,8 @@ class Recipe:
     variants: int = key(least=1, most=1000)
     augmentation: Augmentation = key(within={
         'brightness': (0.0, 1.0), 'contrast': (0.0, 1.0), 'saturation': (0.0, 1.0),
-        'drop_share': (0.0, 0.9), 'max_stride': (1, 20), 'frames': (20, None)})
+        'calibration': (0.0, 0.1), 'drop_share': (0.0, 0.9), 'max_stride': (1, 20),
+        'frames': (20, None)})
     ppo: Ppo = key()
     learning_rate: LearningRate = key()
 
