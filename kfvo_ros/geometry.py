@@ -67,8 +67,12 @@ def log_so3(rotation: np.ndarray) -> np.ndarray:
 
 def rotation_angle(rotation: np.ndarray) -> np.ndarray:
     """Return the angle (...,) [rad], in [0, pi], of rotations (..., 3, 3)."""
-    quaternion = quat_xyzw_from_rotation(rotation)
-    return 2.0 * np.arctan2(np.linalg.norm(quaternion[..., :3], axis=-1), quaternion[..., 3])
+    r = np.asarray(rotation, dtype=np.float64)
+    x, y, z = (r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0],
+               r[..., 1, 0] - r[..., 0, 1])
+    # Twice the sine and the cosine: the one is exact where the other loses digits.
+    return np.arctan2(np.sqrt(x * x + y * y + z * z),
+                      r[..., 0, 0] + r[..., 1, 1] + r[..., 2, 2] - 1.0)
 
 
 def quat_xyzw_from_rotation(rotation: np.ndarray) -> np.ndarray:

@@ -38,7 +38,7 @@ class Knowledge:
         if len(keyframes) == 1 and self.memory is None and self.points is None:
             return None
         T_anchor_world = geometry.invert(keyframes[0].T_world_camera)
-        T_anchor_frame = T_anchor_world @ np.stack([k.T_world_camera for k in keyframes])
+        T_anchor_frame = T_anchor_world @ np.array([k.T_world_camera for k in keyframes])
         T_anchor_frame[0] = np.eye(4)
         return Previous(T_anchor_frame, T_anchor_world @ self.T_world_latest,
                         moved(self.points, T_anchor_world, 1.0), self.memory, self.memory_scale)

@@ -202,6 +202,9 @@ class KeyframeOdometry:
         if keep:
             if len(self._keyframes) == self.window_size - 1:
                 self._retire(self._keyframes.pop(0))
+                anchor = self._keyframes[0]
+                # Products of many drift away from a rotation; all that follow start from this.
+                anchor.T_world_camera = geometry.orthonormalise(anchor.T_world_camera)
             self._keyframes.append(newest)
             placed = Placed(newest.encoded.stamp_ns, newest, np.eye(4), True)
         else:
@@ -247,7 +250,7 @@ class KeyframeOdometry:
 
     def _chain(self, T_anchor_frame: np.ndarray) -> None:
         """Step 4: overwrite the poses of all frames in the window but the anchor's."""
-        poses = geometry.orthonormalise(self._keyframes[0].T_world_camera @ T_anchor_frame)
+        poses = self._keyframes[0].T_world_camera @ T_anchor_frame
         for keyframe, pose in zip((*self._keyframes[1:], self._newest), poses[1:], strict=True):
             keyframe.T_world_camera = pose
 
@@ -264,7 +267,7 @@ class KeyframeOdometry:
         """Step 5: what the policy sees."""
         frames, last = self.window, self._keyframes[-1]
         observation = observe([frame.encoded.descriptor for frame in frames],
-                              np.stack([frame.T_world_camera for frame in frames]),
+                              np.array([frame.T_world_camera for frame in frames]),
                               estimate.signals)
         return DecisionInput(observation, last.tracks, self._newest.tracks,
                              self._newest.index - last.index)

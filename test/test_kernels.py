@@ -58,3 +58,19 @@ def test_nearest_known_points_tell_the_median():
     distances = np.linalg.norm(places[:, None] - known, axis=2)
     expected = np.median(values[np.argsort(distances, axis=1)[:, :5]], axis=1)
     assert np.array_equal(kernels.medians_of_nearest(places, known, values, 5), expected)
+
+
+@pytest.mark.parametrize('share', [0.0, 0.3, 1.0])
+def test_median_where_there_is_something_is_that_of_numpy(share):
+    rng = np.random.default_rng(3)
+    values, mask = rng.random((6, 25)), rng.random((6, 25)) < share
+    typical, count = kernels.median_where(values, mask)
+    assert count == mask.sum()
+    assert typical == (np.median(values[mask]) if count else 0.0)
+
+
+@pytest.mark.parametrize('sizes', [(0, 3), (7, 0), (30, 12), (12, 30)])
+def test_shared_numbers_are_counted(sizes):
+    rng = np.random.default_rng(4)
+    a, b = (np.sort(rng.choice(40, size, replace=False)) for size in sizes)
+    assert kernels.count_shared(a, b) == len(np.intersect1d(a, b))

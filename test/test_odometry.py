@@ -55,6 +55,18 @@ def test_trajectory_follows_the_truth(frames, survival):
     assert set(survival.statuses) == {'ok'}
 
 
+def test_rotations_do_not_wear_off(frames):
+    """What months of products would do is done at once; it is gone after the next keyframe."""
+    odometry = KeyframeOdometry(GeometricBackbone(), Every())
+    for frame in frames[:12]:
+        odometry.process(frame)
+    for keyframe in odometry.window:
+        keyframe.T_world_camera = keyframe.T_world_camera * (1.0 + 1e-7)
+    worn, mended = (odometry.process(frame).T_world_camera[:3, :3] for frame in frames[12:14])
+    assert np.abs(worn @ worn.T - np.eye(3)).max() > 1e-8
+    assert np.abs(mended @ mended.T - np.eye(3)).max() < 1e-14
+
+
 def test_first_seven_are_keyframes_and_then_the_policy_decides(scripted):
     kept = [update.is_keyframe for update in scripted.updates]
     assert kept[:WINDOW_SIZE - 1] == [True] * (WINDOW_SIZE - 1)

@@ -15,6 +15,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -62,7 +63,7 @@ class Points:
     positions: np.ndarray
     information: np.ndarray
 
-    @property
+    @cached_property
     def depths(self) -> np.ndarray:
         """Distances (P,) from the anchor's centre."""
         return np.linalg.norm(self.positions, axis=1)

@@ -109,12 +109,11 @@ class Episode:
     def _window(self) -> tuple[np.ndarray, np.ndarray]:
         """Return estimated and true poses (S, 4, 4) of the frames in the window."""
         window = self._odometry.window
-        return (np.stack([frame.T_world_camera for frame in window]),
+        return (np.array([frame.T_world_camera for frame in window]),
                 self._drive.T_truth_camera[[frame.index for frame in window]])
 
     def _recent(self) -> tuple[np.ndarray, np.ndarray]:
         """Return estimated and true poses (S, 4, 4) of the last input frames, as known now."""
-        # np.stack would take three times as long, at every decision.
         return (np.array([placed.keyframe.T_world_camera for placed in self._trail])
                 @ np.array([placed.T_keyframe_camera for placed in self._trail]),
                 self._drive.T_truth_camera[self._next - len(self._trail):self._next])

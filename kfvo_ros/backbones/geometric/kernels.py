@@ -152,6 +152,28 @@ def median(values):
 
 
 @compiled
+def median_where(values, mask):
+    """Return the median of `values` (F, P) under `mask`, and how many there are; 0 without any."""
+    kept, count = np.empty(values.size), 0
+    for row in range(values.shape[0]):
+        for column in range(values.shape[1]):
+            if mask[row, column]:
+                kept[count] = values[row, column]
+                count += 1
+    return (median(kept[:count]) if count > 0 else 0.0), count
+
+
+@compiled
+def count_shared(a, b):
+    """Return how many numbers are both in `a` and in `b`, both increasing."""
+    i, j, count = 0, 0, 0
+    while i < len(a) and j < len(b):
+        count += a[i] == b[j]
+        i, j = i + (a[i] <= b[j]), j + (a[i] >= b[j])
+    return count
+
+
+@compiled
 def _unit_ray(seen):
     length = math.sqrt(seen[0] * seen[0] + seen[1] * seen[1] + 1.0)
     return seen[0] / length, seen[1] / length, 1.0 / length
@@ -227,6 +249,8 @@ def load() -> None:
     median_shifts(seen, mask, 0, correlate(seen, mask, 0))
     medians_of_nearest(seen[:, 0].copy(), seen[:, 1].copy(), ones, 1)
     median(ones)
+    median_where(np.ones((1, 1)), mask[:, :1])
+    count_shared(ids, ids)
     problem = ba.Problem(hosts, np.tile(np.eye(4), (2, 1, 1)), np.zeros((2, 2, 1)),
                          np.ones((2, 1), dtype=np.bool_), 1.0, 1, ones, ones, 1.0)
     state = ba.adjust(problem, ba.State(rotations, translations, np.ones((3, 1))), 1)

@@ -46,7 +46,8 @@ class Lens:
 
     def straighten(self, points: np.ndarray) -> np.ndarray:
         """Return where points (N, 2) lie, normalised as they are."""
-        return points / (1.0 + _basis(points) @ self.errors)[:, None]
+        near_axis, off_axis = self.errors
+        return points / (1.0 + near_axis + off_axis * _off_axis(points))[:, None]
 
     def told(self, problem: Problem, state: State, noise: float, indices: Sequence[int]) -> Lens:
         """Return what is known after a window, straightened by this lens, has been solved.
@@ -60,10 +61,10 @@ class Lens:
         return Lens(self.errors + np.linalg.solve(known, pull / variance), known, indices[-1])
 
 
-def _basis(points: np.ndarray) -> np.ndarray:
-    """Return by what share each error of the lens moves points (N, 2) off the axis, (N, 2)."""
+def _off_axis(points: np.ndarray) -> np.ndarray:
+    """Return r^2 (N,) of points (N, 2)."""
     x, y = points.T
-    return np.stack([np.ones(len(points)), np.minimum(x * x + y * y, ba.WIDE_ANGLE)], axis=1)
+    return np.minimum(x * x + y * y, ba.WIDE_ANGLE)
 
 
 def marginal(problem: Problem, state: State) -> tuple[np.ndarray, np.ndarray]:

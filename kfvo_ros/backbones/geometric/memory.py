@@ -8,8 +8,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from kfvo_ros import geometry, track_ids
+from kfvo_ros import geometry
 from kfvo_ros.backbones.base import Previous
+from kfvo_ros.backbones.geometric import kernels
 from kfvo_ros.backbones.geometric.lens import Lens
 from kfvo_ros.backbones.geometric.observations import View
 
@@ -85,5 +86,5 @@ def recall(memory: Memory, scale: float, anchor: View) -> History:
 
 def _differ(older: View, newer: View) -> bool:
     """Return whether enough of the older view's tracks ended before the newer one."""
-    shared, _ = track_ids.shared(older.tracks.ids, newer.tracks.ids)
-    return len(shared) < MAX_SHARED * len(older.tracks)
+    shared = kernels.count_shared(older.tracks.ids, newer.tracks.ids)
+    return bool(shared < MAX_SHARED * len(older.tracks))

@@ -175,12 +175,12 @@ def _finish(observations: Observations, draft: _Draft, anchor: int) -> Solution:
 
 def _noise(problem: ba.Problem, errors: np.ndarray) -> float:
     """Return the median of errors (F, P), had they not been fitted; 1 without any [px]."""
-    measured = 2 * problem.mask.sum()
-    if not measured:
+    typical, count = kernels.median_where(errors, problem.mask)
+    if not count:
         return 1.0
     fitted = 3 * problem.mask.any(axis=0).sum() + 6 * (len(problem.mask) - problem.fixed)
-    left = max(1.0 - fitted / measured, LEAST_FREEDOM)
-    return max(LEAST_NOISE, kernels.median(errors[problem.mask]) / math.sqrt(left))
+    left = max(1.0 - fitted / (2 * count), LEAST_FREEDOM)
+    return max(LEAST_NOISE, typical / math.sqrt(left))
 
 
 def _problem(observations: Observations, focal: float, guess: Guess, fixed: int) -> ba.Problem:
