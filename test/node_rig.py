@@ -90,18 +90,19 @@ def is_origin(message: Any) -> bool:
 class Rig:
     """Runs a node between with and its end; `image` and `info` publish what a camera does.
 
-    `parameters` are the node's. With `late` the camera begins at `start_camera`. ``lines`` are
-    what the node logs. One at a time: two would hear each other.
+    `parameters` are the node's, which is ready within `patience` [s]. With `late` the camera
+    begins at `start_camera`. ``lines`` are what the node logs. One at a time: two would hear each
+    other.
     """
 
     def __init__(self, image_type: Any = None, topic: str = IMAGE, qos: QoSProfile = RELIABLE,
-                 late: bool = False, **parameters: Any) -> None:
+                 late: bool = False, patience: float = 20.0, **parameters: Any) -> None:
         self.listener = Listener({
             ODOMETRY: nav_msgs.Odometry, PATH: nav_msgs.Path, KEYFRAME: geometry_msgs.PoseStamped,
             DIAGNOSTICS: diagnostic_msgs.DiagnosticArray})
         self.lines: list[str] = []
         self._image_type, self._topic, self._qos = image_type or sensor_msgs.Image, topic, qos
-        self._late = late
+        self._late, self._patience = late, patience
         parameters = {'process_every_frame': True} | parameters
         self._arguments = ['--ros-args', '-r', f'image:={topic}']
         for name, value in parameters.items():
@@ -116,7 +117,7 @@ class Rig:
         self.process = self._stack.enter_context(running_module(NODE, *self._arguments))
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
-        self.wait_for_line('ready')
+        self.wait_for_line('ready', self._patience)
         wait_until(lambda: self.listener.node.count_publishers(ODOMETRY))
         if not self._late:
             self.wait_for_subscriber()
@@ -186,9 +187,9 @@ class Rig:
         """Wait until diagnostics say so."""
         wait_until(lambda: self.state()[2][key] == str(value))
 
-    def wait_for_line(self, part: str) -> str:
+    def wait_for_line(self, part: str, patience: float = 20.0) -> str:
         """Wait until the node logs a line with this part; return the line."""
-        wait_until(lambda: any(part in line for line in self.lines))
+        wait_until(lambda: any(part in line for line in self.lines), patience)
         return next(line for line in self.lines if part in line)
 
     def call(self, service: Any, name: str, **request: Any) -> Any:

@@ -4,24 +4,19 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 import threading
 
 import numpy as np
 import pytest
 from command_lines import ENVIRONMENT, assert_one_readable_line, run_python
-from vggt_models import WIDTH, frames_seen, torch, window_of
+from vggt_models import WIDTH, frames_seen, needs_compiler, torch, window_of
 
 from kfvo_ros.backbones.base import Window
 from kfvo_ros.backbones.vggt.backbone import VggtBackbone
 from kfvo_ros.backbones.vggt.loading import load_backbone
 
 SIZE = 4
-COMPILER = os.environ.get('CXX') or 'g++'
-pytestmark = pytest.mark.skipif(shutil.which(COMPILER) is None,
-                                reason=f'torch compiles for processors with {COMPILER}, '
-                                'which is not installed')
+pytestmark = needs_compiler
 
 
 @pytest.fixture(scope='module')

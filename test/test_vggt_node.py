@@ -12,8 +12,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from node_rig import NODE, Rig, make_frames, stamp_ns, to_image, to_pose
-from ros_processes import run_module
-from vggt_models import WIDTH
+from ros_processes import ENVIRONMENT, run_module
+from vggt_models import WIDTH, needs_compiler
 
 from kfvo_ros.assembly import make_backbone, make_odometry
 from kfvo_ros.body import T_BODY_OPTICAL, base_pose
@@ -78,6 +78,22 @@ def test_another_size_of_images_starts_anew(drive):
     np.testing.assert_allclose(to_pose(drive.later[0].pose.pose), np.eye(4), atol=1e-12)
     assert drive.code == 0
     assert not [line for line in drive.lines if '[ERROR]' in line or 'Traceback' in line]
+
+
+@needs_compiler
+def test_once_ready_no_frame_waits_for_the_compiler(drive, small_vggt, monkeypatch):
+    """Of compilations torch tells all but the first, which every kind of block follows."""
+    monkeypatch.setitem(ENVIRONMENT, 'TORCH_LOGS', 'recompiles')
+    with Rig(backbone='vggt', weights=small_vggt, image_width=WIDTH, precision='fp32',
+             device='cpu', compile=True, patience=120.0) as rig:
+        rig.send(FRAMES, with_info=False)
+        messages = rig.odometry(COUNT)
+        rig.stop()
+    ready = next(number for number, line in enumerate(rig.lines) if 'ready' in line)
+    assert any('Recompiling' in line for line in rig.lines[:ready])
+    assert not any('Recompiling' in line for line in rig.lines[ready:])
+    for message, right in zip(messages, drive.messages, strict=True):
+        np.testing.assert_allclose(to_pose(message.pose.pose), to_pose(right.pose.pose), atol=1e-4)
 
 
 @pytest.mark.skipif(sys.platform != 'linux', reason='only Linux lets us limit another process')

@@ -11,6 +11,8 @@ from __future__ import annotations
 import copy
 import json
 import math
+import os
+import shutil
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -40,6 +42,10 @@ SMALL = VggtConfig(width=128, trunk_depth=2, depth=3, camera_depth=1, grid=7)
 """Every kind of layer there is, and no more of them than that takes."""
 WIDTH = 70
 """Image width for a small model [px]; images of 4:3 have 4 rows of 5 patches then."""
+COMPILER = os.environ.get('CXX') or 'g++'
+needs_compiler = pytest.mark.skipif(
+    shutil.which(COMPILER) is None,
+    reason=f'torch compiles for processors with {COMPILER}, which is not installed')
 TOKENS = ('cls_token', 'register_tokens', 'mask_token', 'pos_embed', 'camera_token',
           'register_token', 'empty_pose_tokens')
 
