@@ -72,6 +72,15 @@ def test_each_answer_adds_to_what_is_known():
     assert EXPECTED ** 2 > variances[0] > variances[1]
 
 
+def test_frames_that_were_asked_before_do_not_count_again():
+    window = solved(3, (0.0, 0.005), 0.3)
+    fresh, half = (Lens(asked=asked).told(window.problem, window.state, window.noise, range(8))
+                   for asked in (-1, 3))
+    assert (Lens(asked=3).new_in(range(8)), half.new_in(range(8))) == (0.5, 0.0)
+    np.testing.assert_allclose(half.information - Lens().information,
+                               0.5 * (fresh.information - Lens().information))
+
+
 def test_frames_far_apart_say_more_than_successive_ones():
     window = solved(3, (0.0, 0.005), 0.3)
     near, far = (Lens().told(window.problem, window.state, window.noise, range(0, 8 * gap, gap))

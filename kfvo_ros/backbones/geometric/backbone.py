@@ -12,7 +12,7 @@ import numpy as np
 from kfvo_ros.backbones.base import Backbone, Encoded, Estimate, Status, Stream, Window, lost
 from kfvo_ros.backbones.geometric import kernels
 from kfvo_ros.backbones.geometric.initialisation import Initialiser
-from kfvo_ros.backbones.geometric.lens import Lens
+from kfvo_ros.backbones.geometric.lens import ASKED_AGAIN, Lens
 from kfvo_ros.backbones.geometric.memory import Memory, memory_of, recall
 from kfvo_ros.backbones.geometric.observations import View, tabulate
 from kfvo_ros.backbones.geometric.rolling_shutter import RollingShutter
@@ -111,15 +111,15 @@ def _estimate(window: Window, stream: GeometricStream) -> Estimate:
 
 
 def _lens(memory: Memory, solution: Solution, views: tuple[View, ...], camera: Camera) -> Lens:
-    """Ask the window of the lens, unless it holds keyframes that were asked with another one.
+    """Ask the window of the lens, unless most of its frames were asked before.
 
     What a rolling shutter leaves in the tracks would be laid to the lens.
     """
-    if not (memory.certain and solution.measured and views[0].index >= memory.lens.asked
-            and camera.readout_s == 0.0):
-        return memory.lens
-    return memory.lens.told(solution.problem, solution.state, solution.noise,
-                            [view.index for view in views])
+    lens, indices = memory.lens, [view.index for view in views]
+    if not (memory.certain and solution.measured and camera.readout_s == 0.0
+            and lens.new_in(indices) >= ASKED_AGAIN):
+        return lens
+    return lens.told(solution.problem, solution.state, solution.noise, indices)
 
 
 def _describe(grey: np.ndarray) -> np.ndarray:

@@ -4,9 +4,9 @@
 
 Rectified datasets and hurried calibrations are a few pixels off at the rim. In one window that
 hides among the noise, but it is the same in every window: the scale drifts along each street and
-jumps in each turn. So a solved window is asked what it says of the lens, once per set of
-keyframes, and the answers are weighed against each other and against the calibration: a Kalman
-filter of something that does not move.
+jumps in each turn. So solved windows are asked what they say of the lens, again and again within a
+turn, for it tells most, and the answers are weighed against each other and against the
+calibration: a Kalman filter of something that does not move.
 """
 
 from __future__ import annotations
@@ -23,6 +23,8 @@ from kfvo_ros.backbones.geometric.schur import reduce
 EXPECTED = 0.005
 """One standard deviation of a calibration's error: by this share points lie elsewhere, near the
 axis and, in addition, at 45 degrees off it."""
+ASKED_AGAIN = 0.5
+"""A window is asked once so large a share of its frames is new; it counts by that share."""
 ALIKE = 0.7
 """How a track's errors in two successive frames correlate; g frames apart it is ALIKE^g. Errors
 that are alike say less than independent ones would, more so where every frame is a keyframe."""
@@ -49,6 +51,10 @@ class Lens:
         near_axis, off_axis = self.errors
         return points / (1.0 + near_axis + off_axis * _off_axis(points))[:, None]
 
+    def new_in(self, indices: Sequence[int]) -> float:
+        """Return the share of a window's frames, by their indices, that were not asked yet."""
+        return sum(index > self.asked for index in indices) / len(indices)
+
     def told(self, problem: Problem, state: State, noise: float, indices: Sequence[int]) -> Lens:
         """Return what is known after a window, straightened by this lens, has been solved.
 
@@ -56,7 +62,7 @@ class Lens:
         """
         information, pull = marginal(problem, state)
         correlation = ALIKE ** ((indices[-1] - indices[0]) / (len(indices) - 1))
-        variance = noise ** 2 * (1.0 + correlation) / (1.0 - correlation)
+        variance = noise ** 2 * (1.0 + correlation) / (1.0 - correlation) / self.new_in(indices)
         known = self.information + information / variance
         return Lens(self.errors + np.linalg.solve(known, pull / variance), known, indices[-1])
 
