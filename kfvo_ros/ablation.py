@@ -116,7 +116,7 @@ def _go_through(trials: Sequence[Trial], material: Material, options: AblationOp
                 examination: Examination, recipe: Recipe) -> None:
     """Train and test one after the other; table and curves tell of all that there is so far."""
     from kfvo_ros.keyframes.policy_file import read_policy
-    outcomes = list(examination.unlearned(recipe.rail))
+    outcomes = list(examination.unlearned(recipe))
     for number, trial in enumerate(trials, 1):
         print(f'{number} of {len(trials)}: {trial.row}, seed {trial.seed}', flush=True)
         if trial.is_complete(material.learned, material.validation):

@@ -64,14 +64,14 @@ def _train(argv: list[str]) -> None:
         backbone = assembly.make_backbone(chosen.odometry, chosen.vggt)
         plan = chosen.plan(arguments.sequence, arguments.validation, backbone)
         checkpoint = read_checkpoint(files.checkpoint, plan) if arguments.resume else None
-        validation, heuristics = _validation(plan, chosen, backbone)
+        validation, references = _validation(plan, chosen, backbone)
         with closing(make_environment(
                 chosen.lesson(plan), plan.recipe.environments, arguments.workers,
                 plan.seed_at(checkpoint.steps if checkpoint else 0))) as environment:
             files.prepare(arguments.resume)
             about = {'version': __version__,
                      'command': shlex.join(['python', '-m', 'kfvo_ros.train', *argv])}
-            _learn(Training(plan, environment, files, validation, heuristics, about, checkpoint),
+            _learn(Training(plan, environment, files, validation, references, about, checkpoint),
                    files)
 
 
@@ -132,10 +132,12 @@ def _row(name: str, score: Score) -> str:
 
 def _validation(plan: Plan, chosen: Choices, backbone: Backbone
                 ) -> tuple[Validation | None, dict[str, Score]]:
-    """Return what validates, with the scores of the heuristics, which are printed."""
+    """Return what validates, with the scores of heuristics and teacher, which are printed."""
     from tqdm import tqdm
 
     from kfvo_ros import assembly
+    from kfvo_ros.keyframes.rail import NO_RAIL
+    from kfvo_ros.learning.railed import Taught
     from kfvo_ros.learning.validation import Validation
     if not plan.validation:
         print('no validation: the last policy is the one that is kept; name sequences with '
@@ -146,12 +148,16 @@ def _validation(plan: Plan, chosen: Choices, backbone: Backbone
               for text in tqdm(plan.validation, unit='sequence', desc='validation')]
     validation = Validation(drives, backbone, assembly.setting_of(chosen.odometry, backbone))
     print(f'{f"{len(drives)} sequences":<26}{"ATE of path":>12}{"keyframes":>16}')
-    heuristics = {}
-    for name in HEURISTICS:
-        policy = assembly.make_policy(replace(chosen.odometry, keyframes=name), backbone)
-        heuristics[name] = validation.score(policy)
-        print(_row(name, heuristics[name]), flush=True)
-    return validation, heuristics
+    policies = {name: assembly.make_policy(replace(chosen.odometry, keyframes=name), backbone)
+                for name in HEURISTICS}
+    if plan.recipe.teacher is not None:
+        policies[Taught.name] = Taught(plan.recipe.rail or NO_RAIL, plan.recipe.teacher,
+                                       validation.setting.observation)
+    references = {}
+    for name, policy in policies.items():
+        references[name] = validation.score(policy)
+        print(_row(name, references[name]), flush=True)
+    return validation, references
 
 
 def _choose(arguments: argparse.Namespace) -> Choices:

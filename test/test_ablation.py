@@ -30,8 +30,8 @@ pytestmark = pytest.mark.usefixtures('own_signals')
 
 TRAINED = ('full', 'local_signals_only')
 TESTED = ('synthetic:5:smooth', 'synthetic:6:smooth')
-UNLEARNED = ('every', 'optical_flow', 'survival', 'random', 'rail', 'constant_position',
-             'straight_line')
+UNLEARNED = ('every', 'optical_flow', 'survival', 'teacher', 'random', 'rail',
+             'constant_position', 'straight_line')
 
 
 @pytest.fixture(scope='module')
@@ -122,7 +122,7 @@ def test_curves_are_what_was_logged(done):
     assert np.isfinite(curve.returns).all() and (curve.errors > 0.0).all()
     best = read_policy(done / 'full-0.safetensors').training['scores']
     assert curve.errors[:, 1].min() == pytest.approx(best['learned']['ate_percent'])
-    assert curve.heuristics == {name: pytest.approx(best[name]['ate_percent'])
+    assert curve.references == {name: pytest.approx(best[name]['ate_percent'])
                                 for name in ('every', 'optical_flow', 'survival')}
 
 

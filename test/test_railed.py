@@ -9,21 +9,26 @@ import pytest
 
 from kfvo_ros.keyframes.base import DecisionInput
 from kfvo_ros.keyframes.rail import NO_RAIL, Rail
-from kfvo_ros.learning.railed import RailAlone, Random
+from kfvo_ros.learning.railed import RailAlone, Random, Taught
+from kfvo_ros.learning.teacher import Teacher
 from kfvo_ros.tracking import Tracks
 
 COUNT = 100
 RAIL = Rail(min_survival=0.5, max_gap=40, min_flow=2.0)
+LAYOUT = (('flow', 1), ('track_survival', 1), ('baseline_to_depth', 1))
+TEACHER = Teacher(flow=12.0, baseline=0.03, survival=0.2)
 
 
 def decision(flow: float, survivors: int = COUNT, gap: int = 1) -> DecisionInput:
     """Return a decision where `survivors` of the keyframe's tracks moved by `flow` [px]."""
     pixels = np.random.default_rng(0).uniform(0.0, 500.0, (COUNT, 2))
-    return DecisionInput(np.zeros(1, dtype=np.float32), Tracks(np.arange(COUNT), pixels),
+    observation = np.array([np.log1p(flow), survivors / COUNT, 0.0], dtype=np.float32)
+    return DecisionInput(observation, Tracks(np.arange(COUNT), pixels),
                          Tracks(np.arange(survivors), pixels[:survivors] + [flow, 0.0]), gap)
 
 
-@pytest.mark.parametrize('policy', [RailAlone(RAIL), Random(RAIL, 0)])
+@pytest.mark.parametrize('policy', [RailAlone(RAIL), Random(RAIL, 0),
+                                    Taught(RAIL, TEACHER, LAYOUT)])
 def test_the_rail_decides_first(policy):
     assert policy.needs_tracks
     for _ in range(20):
@@ -45,3 +50,8 @@ def test_chance_keeps_every_second_frame_and_a_seed_repeats_it():
     assert runs[0] == runs[1] != runs[2]
     assert all(160 < sum(run) < 240 for run in runs)
     assert not Random(NO_RAIL, 0).needs_tracks
+
+
+def test_where_the_rail_leaves_it_open_the_teacher_decides():
+    policy = Taught(RAIL, TEACHER, LAYOUT)
+    assert [policy.decide(decision(flow)) for flow in (3.0, 11.0, 13.0)] == [False, False, True]

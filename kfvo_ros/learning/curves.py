@@ -16,10 +16,11 @@ from matplotlib.ticker import LogLocator
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from kfvo_ros.keyframes import HEURISTICS
+from kfvo_ros.learning.railed import Taught
 from kfvo_ros.plots import COLOURS, save, tidy
 
 ERROR, RETURN = 'validation_ate_percent/', 'rollout/ep_rew_mean'
-DASHES = dict(zip(HEURISTICS, (':', '--', '-.'), strict=True))
+DASHES = dict(zip((*HEURISTICS, Taught.name), (':', '--', '-.', (0, (1, 3))), strict=True))
 
 
 @dataclass(frozen=True)
@@ -27,14 +28,14 @@ class Curve:
     """One training of a row, with its ``reward``.
 
     ``errors`` (N, 2) and ``returns`` (M, 2): steps, and validation ATE [%] or mean return of the
-    latest episodes; ``heuristics``: their ATE [%] on the same validation.
+    latest episodes; ``references``: the ATE [%] of heuristics and teacher on the same validation.
     """
 
     row: str
     reward: str
     errors: np.ndarray
     returns: np.ndarray
-    heuristics: dict[str, float]
+    references: dict[str, float]
 
 
 def read_curve(row: str, reward: str, folder: Path) -> Curve:
@@ -46,9 +47,9 @@ def read_curve(row: str, reward: str, folder: Path) -> Curve:
         events = logs.Scalars(name) if name in logs.Tags()['scalars'] else []
         return np.array(sorted({each.step: each.value for each in events}.items())).reshape(-1, 2)
 
-    heuristics = {name: values(ERROR + name) for name in HEURISTICS}
+    references = {name: values(ERROR + name) for name in DASHES}
     return Curve(row, reward, values(f'{ERROR}learned'), values(RETURN),
-                 {name: each[-1, 1] for name, each in heuristics.items() if len(each)})
+                 {name: each[-1, 1] for name, each in references.items() if len(each)})
 
 
 def plot_curves(path: Path, curves: Sequence[Curve]) -> None:
@@ -63,7 +64,7 @@ def plot_curves(path: Path, curves: Sequence[Curve]) -> None:
                     layout=ConstrainedLayoutEngine(w_pad=0.15))
     first, *others = figure.subplots(1, 1 + len(rewards), squeeze=False)[0]
     _draw(first, colours, [(curve.row, curve.errors) for curve in curves])
-    for name, error in curves[0].heuristics.items():
+    for name, error in curves[0].references.items():
         first.axhline(error, color='grey', linestyle=DASHES[name], linewidth=1.2, label=name)
     first.set(title='validation', yscale='log', ylabel='ATE after Sim(3) [% of the path]')
     first.yaxis.set(major_locator=LogLocator(subs=(1.0, 2.0, 3.0, 5.0, 7.0)),

@@ -14,10 +14,11 @@ from kfvo_ros.backbones.base import Backbone
 from kfvo_ros.keyframes import HEURISTICS
 from kfvo_ros.keyframes.base import KeyframePolicy
 from kfvo_ros.keyframes.learned import Setting
-from kfvo_ros.keyframes.rail import NO_RAIL, Rail
+from kfvo_ros.keyframes.rail import NO_RAIL
 from kfvo_ros.learning.ablation_table import Outcome
 from kfvo_ros.learning.drives import Drive
-from kfvo_ros.learning.railed import RailAlone, Random
+from kfvo_ros.learning.railed import RailAlone, Random, Taught
+from kfvo_ros.learning.recipe import Recipe
 from kfvo_ros.learning.validation import LEAST_PERCENT, Validation
 from kfvo_ros.options import OdometryOptions
 from kfvo_ros.trajectory import Trajectory
@@ -45,14 +46,21 @@ class Examination:
             score = Validation([drive], self.backbone, self.setting).score(policy)
             yield Outcome(row, seed, name, score.ate_percent, score.kept)
 
-    def unlearned(self, rail: Rail | None) -> Iterator[Outcome]:
-        """Yield how the heuristics do, chance inside the rail, the rail, and no odometry."""
+    def unlearned(self, recipe: Recipe) -> Iterator[Outcome]:
+        """Yield how the heuristics do, a recipe's teacher, chance and nothing inside its rail.
+
+        And no odometry at all.
+        """
+        rail = recipe.rail or NO_RAIL
         for name in HEURISTICS:
             options = replace(self.options, keyframes=name)
             yield from self.outcomes(name, None, assembly.make_policy(options, self.backbone))
+        if recipe.teacher is not None:
+            yield from self.outcomes(Taught.name, None, Taught(rail, recipe.teacher,
+                                                               self.setting.observation))
         for seed in DICE:
-            yield from self.outcomes(Random.name, seed, Random(rail or NO_RAIL, seed))
-        if rail is not None:
+            yield from self.outcomes(Random.name, seed, Random(rail, seed))
+        if recipe.rail is not None:
             yield from self.outcomes(RailAlone.name, None, RailAlone(rail))
         for trivial in (metrics.constant_position, metrics.straight_line):
             for name, drive in self.drives.items():

@@ -38,14 +38,14 @@ class Training:
     """Learns until the plan is fulfilled: `learn`; when that was interrupted, `save`.
 
     The best policy by ATE is written as soon as it is known; without validation that is the
-    last one. `heuristics` were scored on the same drives; `about` goes into the policy files.
+    last one. `references` were scored on the same drives; `about` goes into the policy files.
     """
 
     def __init__(self, plan: Plan, environment: VecEnv, files: TrainingFiles,
-                 validation: Validation | None, heuristics: dict[str, Score],
+                 validation: Validation | None, references: dict[str, Score],
                  about: dict[str, str], checkpoint: Checkpoint | None = None) -> None:
         self.plan, self._files, self._validation = plan, files, validation
-        self._heuristics, self._about = heuristics, about
+        self._references, self._about = references, about
         self.steps, self._best = 0, math.inf
         if checkpoint is not None:
             self.steps, self._best = checkpoint.steps, checkpoint.best
@@ -55,7 +55,7 @@ class Training:
                                      [TensorBoardOutputFormat(str(files.folder))]))
         if checkpoint is not None:
             checkpoint.restore(self.model)
-        for name, score in heuristics.items():
+        for name, score in references.items():
             self._log(name, score)
 
     def learn(self, witness: Witness) -> None:
@@ -77,7 +77,7 @@ class Training:
         if self._validation is not None:
             policy = self.policy_file().policy(self._validation.setting)
             score = self._validation.score(policy, witness.validating)
-            scores = self._heuristics | {'learned': score}
+            scores = self._references | {'learned': score}
             is_best = score.ate_percent < self._best
             if is_best:
                 self._best = score.ate_percent
