@@ -37,12 +37,13 @@ PYTHON := $(shell for python in $(CANDIDATES); do \
 	$$python -c '$(SUPPORTED)' 2>/dev/null && echo $$python && break; done)
 endif
 
-# docs/results.md: what of KFVO_DATA looks like a dataset, called as from there, and rooms.
+# docs/results.md: what of KFVO_DATA looks like a dataset, called as from there, and what is
+# rendered.
 MARKS := mav0 rgb.txt times.txt pose_left.txt
 FOUND = $(foreach mark,$(MARKS),$(foreach depth,* */* */*/* */*/*/*,\
 	$(wildcard $(KFVO_DATA)/$(depth)/$(mark))))
 SEQUENCES ?= $(patsubst $(KFVO_DATA)/%/,%,$(sort $(dir $(FOUND)))) \
-	synthetic:0-2:smooth synthetic:0-2:fast
+	synthetic:0-2:smooth synthetic:0-2:fast synthetic:0-2:street
 POLICY ?=
 OPTIONS ?= --seeds 0,1,2
 
@@ -53,7 +54,7 @@ help:
 	@echo 'make test    install into $(VENV) and run ruff and the tests'
 	@echo 'make bench-node   a minute of 752x480 at 20 Hz, then at twice what the node can take'
 	@echo 'make bench-train  decisions per second of the environment, and of PPO'
-	@echo 'make results  docs/results.md: all methods on KFVO_DATA and on rooms; POLICY=FILE: a'
+	@echo 'make results  docs/results.md: all methods on KFVO_DATA, rooms and streets; POLICY=FILE: a'
 	@echo '              learned one too. It goes on where it was interrupted'
 	@echo 'make lint    ruff and mypy'
 	@echo 'make clean   remove the environments and all that was built'

@@ -105,15 +105,18 @@ class Update:
 class KeyframeOdometry:
     """Feed frames in order, get poses: `process` is the method, `finish` ends the sequence.
 
-    `scale_rule` None takes the backbone's own. A caller that batches many sequences into one
-    backbone call runs the steps of `process` itself: `begin`, `integrate`, `commit`.
+    `scale_rule` None takes the backbone's own; without `with_covariance` all covariances stay
+    zero. A caller that batches many sequences into one backbone call runs the steps of `process`
+    itself: `begin`, `integrate`, `commit`.
     """
 
     def __init__(self, backbone: Backbone, policy: KeyframePolicy,
-                 scale_rule: str | None = None, window_size: int = WINDOW_SIZE) -> None:
+                 scale_rule: str | None = None, window_size: int = WINDOW_SIZE,
+                 with_covariance: bool = True) -> None:
         self.backbone = backbone
         self.policy = policy
         self.window_size = window_size
+        self._with_covariance = with_covariance
         self.scale = ScaleAligner(scale_rule or backbone.default_scale_rule)
         self._stream: Stream | None = None
         self._tracker: Tracker | None = None
@@ -187,7 +190,8 @@ class KeyframeOdometry:
         T_world_anchor = self._keyframes[0].T_world_camera
         self._status, self._intrinsics = estimate.status, estimate.intrinsics
         self._parts = estimate.durations
-        self._doubt(estimate, scale)
+        if self._with_covariance:
+            self._doubt(estimate, scale)
         self._known = Knowledge(
             self._newest.T_world_camera,
             self._known.covariance if estimate.status is Status.LOST else self._newest.covariance,

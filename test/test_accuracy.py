@@ -85,6 +85,6 @@ def test_standing_still(policy, data_path):
 
 
 @pytest.mark.parametrize(('policy', 'bound'), [('every', 0.8), ('survival', 0.6)])
-@pytest.mark.parametrize('name', ['synthetic:0:smooth', 'synthetic:1:fast'])
+@pytest.mark.parametrize('name', ['synthetic:0:smooth', 'synthetic:1:fast', 'synthetic:3:street'])
 def test_rendered(name, policy, bound):
     assert error_percent(name, 80, policy) <= bound

@@ -203,6 +203,15 @@ def test_update_tells_covariance_depth_and_durations(survival):
     assert survival.updates[0].median_depth is None
 
 
+def test_without_covariance_all_else_is_the_same(frames, survival):
+    plain = run(frames[:20], with_covariance=False)
+    for update, expected in zip(plain.updates, survival.updates, strict=False):
+        assert update.T_world_camera.tobytes() == expected.T_world_camera.tobytes()
+        assert update.is_keyframe == expected.is_keyframe
+        assert not update.covariance.any() and not update.window_covariance.any()
+    assert survival.updates[19].covariance.any()
+
+
 def test_finish_hands_out_each_frame_once(frames):
     odometry = KeyframeOdometry(GeometricBackbone(), Survival())
     early = [placed for frame in frames[:9] for placed in odometry.process(frame).final]

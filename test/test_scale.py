@@ -39,7 +39,7 @@ def estimate(unit: float, with_points: bool = True, translations: float | None =
              ) -> Estimate:
     """Return a window whose unit is `unit` trajectory units."""
     return Estimate(poses(1.0 / unit if translations is None else translations),
-                    np.zeros((8, 6, 6)), points(1.0 / unit) if with_points else None,
+                    lambda: np.zeros((8, 6, 6)), points(1.0 / unit) if with_points else None,
                     np.zeros(0, dtype=np.float32))
 
 
@@ -66,7 +66,7 @@ def test_each_rule_looks_at_its_own_evidence():
 def test_depth_falls_back_to_translation_without_points():
     contradictory = estimate(2.0, with_points=False, translations=1.0 / 3.0)
     assert ScaleAligner('depth').align(contradictory, previous(False)) == pytest.approx(3.0)
-    others = Estimate(contradictory.T_anchor_frame, contradictory.covariance,
+    others = Estimate(contradictory.T_anchor_frame, contradictory.make_covariance,
                       points(0.5, first_id=1000), contradictory.signals)
     assert ScaleAligner('depth').align(others, previous()) == pytest.approx(3.0)
 

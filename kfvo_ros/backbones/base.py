@@ -12,7 +12,7 @@ make one batch.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from functools import cached_property
@@ -100,22 +100,29 @@ class Estimate:
     """What a backbone says of one window.
 
     ``T_anchor_frame`` (S, 4, 4) float64, the first exactly identity, translations in one
-    unit per window; ``covariance`` (S, 6, 6) of each pose in the anchor, translation first,
-    then rotation [rad]; ``points`` or None; ``signals`` (len(signal_names),) float32 for the
-    policy; ``status`` of the newest frame; ``memory`` comes back in the next `Previous`;
-    ``intrinsics`` K (3, 3) of the newest image [px] from a model that estimates them;
-    ``durations`` [s] of parts of the call that people compare, such as ``head``, of a batch
-    the window's share.
+    unit per window; ``make_covariance`` returns what ``covariance`` is; ``points`` or None;
+    ``signals`` (len(signal_names),) float32 for the policy; ``status`` of the newest frame;
+    ``memory`` comes back in the next `Previous`; ``intrinsics`` K (3, 3) of the newest image [px]
+    from a model that estimates them; ``durations`` [s] of parts of the call that people compare,
+    such as ``head``, of a batch the window's share.
     """
 
     T_anchor_frame: np.ndarray
-    covariance: np.ndarray
+    make_covariance: Callable[[], np.ndarray]
     points: Points | None
     signals: np.ndarray
     status: Status = Status.OK
     memory: Any = None
     intrinsics: np.ndarray | None = None
     durations: Mapping[str, float] = field(default_factory=dict)
+
+    @cached_property
+    def covariance(self) -> np.ndarray:
+        """Covariances (S, 6, 6) of poses in the anchor, translation before rotation [rad].
+
+        They take their time, which trainings do without.
+        """
+        return self.make_covariance()
 
 
 def lost(window: Window, signal_count: int = 0, memory: Any = None) -> Estimate:
@@ -132,7 +139,7 @@ def lost(window: Window, signal_count: int = 0, memory: Any = None) -> Estimate:
         points, memory = window.previous.points, window.previous.memory
     covariance = np.tile(LOST_VARIANCE * np.eye(6), (frames, 1, 1))
     covariance[0] = 0.0
-    return Estimate(T_anchor_frame, covariance, points,
+    return Estimate(T_anchor_frame, lambda: covariance, points,
                     np.zeros(signal_count, dtype=np.float32), Status.LOST, memory)
 
 

@@ -36,7 +36,8 @@ class Episode:
     def __init__(self, drive: Drive, backbone: Backbone, scale_rule: str, window_size: int,
                  rail: Rail, reward: Reward) -> None:
         self._drive, self._rail, self._reward = drive, rail, reward
-        self._odometry = KeyframeOdometry(backbone, Every(), scale_rule, window_size)
+        self._odometry = KeyframeOdometry(backbone, Every(), scale_rule, window_size,
+                                          with_covariance=False)
         self._trail: deque[Placed] = deque(maxlen=reward.span or 0)
         self._next = 0
         self.decision: DecisionInput | None = None

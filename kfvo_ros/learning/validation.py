@@ -62,7 +62,7 @@ class Validation:
     def _run(self, policy: KeyframePolicy, drive: Drive) -> tuple[Trajectory, int]:
         """Return the refined poses of all frames, and how many frames were kept."""
         odometry = KeyframeOdometry(self.backbone, policy, self.setting.scale_rule,
-                                    self.setting.window_size)
+                                    self.setting.window_size, with_covariance=False)
         placed: list[Placed] = []
         for frame, encoded in zip(drive.frames, drive.encoded, strict=True):
             window = odometry.begin(frame, encoded)

@@ -103,7 +103,7 @@ def _estimate(window: Window, stream: GeometricStream) -> Estimate:
     if solution.problem.mask[-1].sum() < MIN_TRACKS or not np.isfinite(poses).all():
         return lost(window, len(SIGNAL_NAMES), Memory())
     motion = measure_motion(solution, views[-2], views[-1], stream.initialiser.focal)
-    return Estimate(poses[solution.anchor:], solution.covariance(), solution.points,
+    return Estimate(poses[solution.anchor:], solution.covariance, solution.points,
                     signals(solution, motion),
                     Status.HELD if motion.window_parallax < HELD_PARALLAX else Status.OK,
                     Memory(history.views + views, poses, solution.measured, memory.windows + 1,

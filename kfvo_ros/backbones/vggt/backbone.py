@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import TypeVar
 
 import numpy as np
@@ -169,8 +170,8 @@ def _estimate(window: Window, encodings: np.ndarray) -> Estimate:
     T_anchor_frame[0] = np.eye(4)
     fitted = window.frames[-1].payload.fit
     K = pose_encoding.intrinsics(encodings[-1], fitted.rows, fitted.width)
-    return Estimate(T_anchor_frame, _covariance(before[0] @ geometry.invert(before),
-                                                T_anchor_frame),
+    return Estimate(T_anchor_frame, partial(_covariance, before[0] @ geometry.invert(before),
+                                            T_anchor_frame),
                     points=None, signals=np.zeros(0, dtype=np.float32),
                     intrinsics=fitted.native(K[-1]))
 
