@@ -36,7 +36,7 @@ def make_backbone(options: OdometryOptions, vggt: VggtOptions | None = None) -> 
 
 def make_policy(options: OdometryOptions, backbone: Backbone) -> KeyframePolicy:
     """Return the keyframe policy that `options` name, for this backbone; raises KfvoError."""
-    if options.policy is not None and options.keyframes != 'learned':
+    if options.policy is not None and options.keyframes not in (None, 'learned'):
         raise KfvoError(f'the policy file {options.policy} is for keyframes learned, came '
                         f'keyframes {options.keyframes}: choose learned, or leave the policy out')
     if options.keyframes == 'every':
@@ -46,11 +46,15 @@ def make_policy(options: OdometryOptions, backbone: Backbone) -> KeyframePolicy:
     if options.keyframes == 'survival':
         return Survival(options.survival_share)
     from kfvo_ros.keyframes.policy_file import find_policy, read_policy
-    path = find_policy(options.policy, backbone.name)
-    if path is None:
+    path, setting = find_policy(options.policy, backbone.name), setting_of(options, backbone)
+    file = read_policy(path) if path is not None else None
+    unasked = options.keyframes is None and options.policy is None
+    if unasked and (file is None or file.setting.misfit(setting) is not None):
+        return Survival(options.survival_share)
+    if file is None:
         raise KfvoError(f'no learned policy comes with the {backbone.name} backbone: expected the '
                         'file of one in policy, none came')
-    return read_policy(path).policy(setting_of(options, backbone))
+    return file.policy(setting)
 
 
 def setting_of(options: OdometryOptions, backbone: Backbone) -> Setting:

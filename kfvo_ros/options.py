@@ -40,7 +40,9 @@ class OdometryOptions:
     scale_rule: str | None = option(
         None, "scale alignment between windows; default the backbone's own", SCALE_RULES,
         flag='scale')
-    keyframes: str = option('survival', 'policy that decides which frames stay', POLICIES)
+    keyframes: str | None = option(
+        None, 'policy that decides which frames stay; default: a policy file, or the learned one '
+        'that comes with the backbone where it fits, else survival', POLICIES)
     flow_threshold: float = option(
         50.0, 'optical_flow: keep when the tracks moved farther since the last keyframe [px]',
         least=0.0)

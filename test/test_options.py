@@ -176,7 +176,16 @@ def test_odometry_is_what_the_options_say(keyframes):
 
 def test_policy_file_is_not_ignored_where_nothing_learned_was_asked_for():
     with pytest.raises(KfvoError, match='every is for keyframes learned, came keyframes survival'):
-        assembly.make_odometry(OdometryOptions(policy='every'))
+        assembly.make_odometry(OdometryOptions(keyframes='survival', policy='every'))
+    with pytest.raises(KfvoError, match='cannot read the policy none-such'):
+        assembly.make_odometry(OdometryOptions(policy='none-such'))
+
+
+@pytest.mark.parametrize(('options', 'policy'), [
+    ({}, 'learned'), ({'scale_rule': 'depth'}, 'learned'), ({'scale_rule': 'none'}, 'survival'),
+    ({'window_size': 6}, 'survival'), ({'keyframes': 'every'}, 'every')])
+def test_the_default_policy_is_the_learned_one_where_it_fits(options, policy):
+    assert assembly.make_odometry(OdometryOptions(**options)).policy.name == policy
 
 
 def test_scale_rule_is_the_backbones_unless_chosen():
