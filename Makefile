@@ -43,7 +43,7 @@ MARKS := mav0 rgb.txt times.txt pose_left.txt
 FOUND = $(foreach mark,$(MARKS),$(foreach depth,* */* */*/* */*/*/*,\
 	$(wildcard $(KFVO_DATA)/$(depth)/$(mark))))
 SEQUENCES ?= $(patsubst $(KFVO_DATA)/%/,%,$(sort $(dir $(FOUND)))) \
-	synthetic:0-2:smooth synthetic:0-2:fast synthetic:0-2:street
+	synthetic:0-2:street synthetic:0-2:smooth synthetic:0-2:fast
 POLICY ?=
 OPTIONS ?= --seeds 0,1,2
 

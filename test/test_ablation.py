@@ -30,8 +30,8 @@ pytestmark = pytest.mark.usefixtures('own_signals')
 
 TRAINED = ('full', 'local_signals_only')
 TESTED = ('synthetic:5:smooth', 'synthetic:6:smooth')
-UNLEARNED = ('every', 'optical_flow', 'survival', 'teacher', 'random', 'rail',
-             'constant_position', 'straight_line')
+UNLEARNED = ('every', 'optical_flow', 'survival', 'random', 'rail', 'constant_position',
+             'straight_line')
 
 
 @pytest.fixture(scope='module')
@@ -98,6 +98,16 @@ def test_the_table_has_all_rows_and_the_curves_are_a_picture(done):
     assert sum('geometric mean over 2 sequences' in line for line in lines) == 1
     picture = cv2.imread(str(done / 'curves.png'))
     assert picture.shape[1] > 2 * picture.shape[0] and len(np.unique(picture)) > 50
+
+
+def test_a_teacher_has_a_row_of_its_own(folder):
+    recipe = read_recipe('train.yaml')
+    options = ablation.AblationOptions(stop=30, cache=str(folder / 'cache'))
+    outcomes = list(ablation._examination(recipe, TESTED[:1], options).unlearned(recipe))
+    assert [each.row for each in outcomes if each.row != 'random'] == [
+        *UNLEARNED[:3], 'teacher', *UNLEARNED[4:]]
+    taught = next(each for each in outcomes if each.row == 'teacher')
+    assert 0.0 < taught.kept <= 1.0 and taught.ate_percent > 0.0
 
 
 def test_each_row_learned_what_it_says(done):

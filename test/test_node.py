@@ -124,7 +124,7 @@ def test_diagnostics_count(drive):
     assert [values[key] for key in counted] == ['0', str(COUNT), str(COUNT), '0', '0', '0']
     assert 1 <= int(values['keyframes']) <= COUNT
     assert float(values['latency median [ms]']) > 0.0 and float(values['memory [MiB]']) > 10.0
-    assert (values['backbone'], values['keyframe policy']) == ('geometric', 'survival')
+    assert (values['backbone'], values['keyframe policy']) == ('geometric', 'learned')
 
 
 def test_keyframes_are_poses_again(drive):

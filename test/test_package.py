@@ -100,12 +100,13 @@ def test_a_node_without_vggt_does_without_torch() -> None:
             'import kfvo_ros.node, kfvo_ros.run, kfvo_ros.ros.node\n'
             'from kfvo_ros.assembly import make_odometry\n'
             'from kfvo_ros.options import OdometryOptions\n'
-            'assert make_odometry(OdometryOptions()).backbone.name == "geometric"\n'
+            'odometry = make_odometry(OdometryOptions())\n'
+            'assert (odometry.backbone.name, odometry.policy.name) == ("geometric", "learned")\n'
             'print(*sys.modules)')
     outcome = run_python('-c', code)
     assert outcome.returncode == 0, outcome.stderr
     loaded = set(outcome.stdout.split())
-    assert 'rclpy' in loaded and not loaded & {'torch', 'PIL', 'safetensors', 'huggingface_hub'}
+    assert 'rclpy' in loaded and not loaded & {'torch', 'PIL', 'huggingface_hub'}
 
 
 # A missing dependency

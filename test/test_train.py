@@ -71,8 +71,8 @@ def test_smoke_needs_nothing_else(tmp_path, monkeypatch, capsys):
                        'smoke.safetensors']) == 0
     output = capsys.readouterr().out
     rows = [line.split()[0] for line in output.splitlines()]
-    assert rows[1:5] == ['every', 'optical_flow', 'survival', 'learned,']
-    assert 'best' in output.splitlines()[4]
+    assert rows[1:6] == ['every', 'optical_flow', 'survival', 'teacher', 'learned,']
+    assert 'best' in output.splitlines()[5]
     assert read_policy(Path('smoke.safetensors')).training['steps'] == 200
 
 
