@@ -15,7 +15,7 @@ from kfvo_ros import geometry, metrics
 from kfvo_ros.backbones.base import Estimate, Points, Previous, Window
 from kfvo_ros.backbones.geometric.backbone import GeometricBackbone
 from kfvo_ros.backbones.geometric.initialisation import Initialiser
-from kfvo_ros.backbones.geometric.lens import EXPECTED, Lens, marginal
+from kfvo_ros.backbones.geometric.lens import EXPECTED, LEAST_VIEWS, Lens, marginal
 from kfvo_ros.backbones.geometric.memory import History, Memory, memory_of
 from kfvo_ros.backbones.geometric.observations import tabulate
 from kfvo_ros.backbones.geometric.window import Solution, solve
@@ -60,6 +60,20 @@ def test_noisy_tracks_tell_as_much_as_they_claim():
         information, pull = information + one, pull + by_one
     assert pull @ np.linalg.solve(information, pull) < 12.0, 'of two, exceeded once in 400'
     assert 0.5 < np.mean(squares) < 3.0, 'a chi square of two has mean two; the loss is careful'
+
+
+def test_short_tracks_are_not_asked():
+    """However wrong they are, they change nothing."""
+    window = solved(3, (0.0, 0.005), 0.3)
+    short = np.arange(window.problem.mask.shape[1]) % 2 == 0
+    mask, seen = window.problem.mask.copy(), window.problem.seen.copy()
+    mask[LEAST_VIEWS - 1:, short] = False
+    seen[:, :, short] *= 1.1
+    long = window.problem.of_points(~short)
+    for told, alone in zip(
+            marginal(window.problem._replace(mask=mask, seen=seen), window.state),
+            marginal(long, window.state.of_points(~short)), strict=True):
+        np.testing.assert_allclose(told, alone)
 
 
 def test_each_answer_adds_to_what_is_known():

@@ -23,8 +23,10 @@ from kfvo_ros.backbones.geometric.schur import reduce
 EXPECTED = 0.005
 """One standard deviation of a calibration's error: by this share points lie elsewhere, near the
 axis and, in addition, at 45 degrees off it."""
-ASKED_AGAIN = 0.5
+ASKED_AGAIN = 0.25
 """A window is asked once so large a share of its frames is new; it counts by that share."""
+LEAST_VIEWS = 4
+"""Tracks seen in fewer frames of a window need nearly all that they say for themselves."""
 ALIKE = 0.7
 """How a track's errors in two successive frames correlate; g frames apart it is ALIKE^g. Errors
 that are alike say less than independent ones would, more so where every frame is a keyframe."""
@@ -76,10 +78,12 @@ def _off_axis(points: np.ndarray) -> np.ndarray:
 def marginal(problem: Problem, state: State) -> tuple[np.ndarray, np.ndarray]:
     """Return information (2, 2) on the errors of the lens, and its pull (2,) on them.
 
-    Both are for tracks off by 1 px, all else in the window set free but the first frame; the
-    errors are most likely information^-1 @ pull. Scale is held by what is expected of depths.
+    Both are by the longer tracks, off by 1 px, all else set free but the first frame; the errors
+    are most likely information^-1 @ pull. Scale is held by what is expected of depths.
     """
-    system, gradient = reduce(ba.linearise(problem._replace(fixed=1), state, True))
+    long = problem.mask.sum(axis=0) >= LEAST_VIEWS
+    free = problem.of_points(long)._replace(fixed=1)
+    system, gradient = reduce(ba.linearise(free, state.of_points(long), True))
     poses, lens = slice(0, -ba.LENS), slice(-ba.LENS, None)
     right = np.column_stack([system[poses, lens], gradient[poses]])
     eliminated = system[lens, poses] @ np.linalg.solve(system[poses, poses], right)

@@ -29,6 +29,14 @@ class Problem(NamedTuple):
     prior_values: np.ndarray
     width: float
 
+    def of_points(self, chosen: np.ndarray) -> Problem:
+        """Return what is measured of some points (P,) alone."""
+        return self._replace(hosts=self.hosts[chosen],
+                             seen=np.ascontiguousarray(self.seen[:, :, chosen]),
+                             mask=np.ascontiguousarray(self.mask[:, chosen]),
+                             prior_weights=self.prior_weights[chosen],
+                             prior_values=self.prior_values[chosen])
+
 
 class State(NamedTuple):
     """Where frames are in the anchor, and points in their origins.
@@ -39,6 +47,10 @@ class State(NamedTuple):
     rotations: np.ndarray
     translations: np.ndarray
     points: np.ndarray
+
+    def of_points(self, chosen: np.ndarray) -> State:
+        """Return the state of some points (P,) alone, and of all frames."""
+        return self._replace(points=np.ascontiguousarray(self.points[:, chosen]))
 
     def scaled(self, factor: float) -> State:
         """Return the same window in another unit, which its origins have to be in too."""
