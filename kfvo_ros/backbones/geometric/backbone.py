@@ -9,7 +9,16 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from kfvo_ros.backbones.base import Backbone, Encoded, Estimate, Status, Stream, Window, lost
+from kfvo_ros.backbones.base import (
+    Backbone,
+    Encoded,
+    Estimate,
+    Points,
+    Status,
+    Stream,
+    Window,
+    lost,
+)
 from kfvo_ros.backbones.geometric import kernels
 from kfvo_ros.backbones.geometric.initialisation import Initialiser
 from kfvo_ros.backbones.geometric.lens import ASKED_AGAIN, Lens
@@ -17,7 +26,7 @@ from kfvo_ros.backbones.geometric.memory import Memory, memory_of, recall
 from kfvo_ros.backbones.geometric.observations import View, tabulate
 from kfvo_ros.backbones.geometric.rolling_shutter import RollingShutter
 from kfvo_ros.backbones.geometric.signals import SIGNAL_NAMES, measure_motion, signals
-from kfvo_ros.backbones.geometric.window import Solution, solve
+from kfvo_ros.backbones.geometric.window import MIN_INFORMATION, Solution, solve
 from kfvo_ros.camera import Camera
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.images import to_grey
@@ -106,12 +115,20 @@ def _estimate(window: Window, stream: GeometricStream) -> Estimate:
     return Estimate(poses[solution.anchor:], solution.covariance, solution.points,
                     signals(solution, motion),
                     Status.HELD if motion.window_parallax < HELD_PARALLAX else Status.OK,
-                    Memory(history.views + views, poses, solution.measured, memory.windows + 1,
-                           _lens(memory, solution, views, stream.camera)))
+                    Memory(history.views + views, poses, memory.measured or solution.measured,
+                           memory.windows + 1,
+                           _lens(memory, solution, views, stream.camera),
+                           _trusted(memory, solution.points)))
+
+
+def _trusted(memory: Memory, points: Points) -> np.ndarray:
+    """Return the ids of those points whose depths are measured well, or once were."""
+    return points.ids[(points.information > MIN_INFORMATION)
+                      | np.isin(points.ids, memory.trusted)]
 
 
 def _lens(memory: Memory, solution: Solution, views: tuple[View, ...], camera: Camera) -> Lens:
-    """Ask the window of the lens, unless most of its frames were asked before.
+    """Ask the window of the lens, once enough of its frames are new.
 
     What a rolling shutter leaves in the tracks would be laid to the lens.
     """

@@ -14,7 +14,7 @@ from kfvo_ros import geometry, track_ids
 from kfvo_ros.backbones.base import Previous
 from kfvo_ros.backbones.geometric import kernels
 from kfvo_ros.backbones.geometric.bundle_adjustment import MIN_DEPTH, State
-from kfvo_ros.backbones.geometric.memory import History
+from kfvo_ros.backbones.geometric.memory import History, memory_of
 from kfvo_ros.backbones.geometric.observations import Observations
 
 MIN_PAIR_TRACKS = 12
@@ -42,12 +42,12 @@ REFINEMENT = {'max_iterations': 5}
 class Guess:
     """Where to start, and the inverse depths (P,) to expect when nothing better is measured.
 
-    ``known`` (P,) marks the points that an earlier window measured.
+    ``trusted`` (P,) marks the points whose depths earlier windows measured well.
     """
 
     state: State
     expected_inverse_depths: np.ndarray
-    known: np.ndarray
+    trusted: np.ndarray
 
 
 class Initialiser:
@@ -108,7 +108,8 @@ class Initialiser:
                 observations, T_anchor_frame, known, visible, len(T_anchor_frame) - 1,
                 previous.T_anchor_latest)
         state = self._complete(observations, T_anchor_frame, known)
-        return Guess(state, _expect(observations, known, state.points[2]), is_known)
+        trusted = is_known & np.isin(observations.ids, memory_of(previous).trusted)
+        return Guess(state, _expect(observations, known, state.points[2]), trusted)
 
     def _best_pair(self, observations: Observations) -> tuple[int, int] | None:
         """Return the two frames whose relative pose is best determined."""

@@ -30,8 +30,9 @@ MIN_WINDOWS = 6
 class Memory:
     """The views of a window and its history at ``T_anchor_view``.
 
-    ``measured`` says that depths were measured well, ``windows`` how many there were in a row;
-    ``lens`` is what is known of the lens by then.
+    ``measured`` says that depths were measured well at some time, ``windows`` how many there were
+    in a row since the start; ``lens`` is what is known of the lens by then; ``trusted`` are the
+    ids of the points whose own depths were measured well.
     """
 
     views: tuple[View, ...] = ()
@@ -39,6 +40,7 @@ class Memory:
     measured: bool = False
     windows: int = 0
     lens: Lens = field(default_factory=Lens)
+    trusted: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     @property
     def certain(self) -> bool:

@@ -29,12 +29,13 @@ near, should hardly pull."""
 MAX_NOISE, MAX_ERROR = 4.5, (2.0, 5.0)
 """Tracks farther off anywhere after the first adjustment are outliers: so many times the noise,
 within bounds [px], for where nothing fits noise has none."""
-KNOWN_DEPTH_PRIOR = 1.0
-"""How strongly a point holds its last depth [px^2 for a depth wrong by 100 %].
+TRUSTED_DEPTH_PRIOR = 1.0
+"""How strongly a point whose depth was measured holds its last [px^2 for one wrong by 100 %].
 
 It keeps the scale through rotation and hovering, where nothing is measured."""
-NEW_DEPTH_PRIOR = 0.05
-"""The same for new points and the depth around them: they are less certain to have it."""
+DEPTH_PRIOR = 0.05
+"""The same for others: of what rotation brought into view the depth is but supposed, and hundreds
+that hold on to it would outweigh the motion after it."""
 LEAST_PRIOR_SPREAD = 0.2
 """The same for points so far away that 100 % of their inverse depth is nothing: this share of
 the median's."""
@@ -186,7 +187,7 @@ def _noise(problem: ba.Problem, errors: np.ndarray) -> float:
 def _problem(observations: Observations, focal: float, guess: Guess, fixed: int) -> ba.Problem:
     """Return the bundle adjustment of a window, depths drawn to where they are expected."""
     expected = guess.expected_inverse_depths
-    strength = np.where(guess.known, KNOWN_DEPTH_PRIOR, NEW_DEPTH_PRIOR)
+    strength = np.where(guess.trusted, TRUSTED_DEPTH_PRIOR, DEPTH_PRIOR)
     spread = np.maximum(expected, LEAST_PRIOR_SPREAD * kernels.median(expected))
     origins = geometry.make_transform(guess.state.rotations, guess.state.translations)
     return ba.Problem(observations.hosts, origins,
