@@ -18,10 +18,10 @@ from contextlib import contextmanager, nullcontext
 
 import torch
 from torch import nn
-from torch.nn import functional
 
 from kfvo_ros.backbones.vggt.compiling import compile_blocks, compiler_needed
-from kfvo_ros.backbones.vggt.config import PATCH, VggtConfig
+from kfvo_ros.backbones.vggt.config import PATCH
+from kfvo_ros.backbones.vggt.layers import Block
 from kfvo_ros.backbones.vggt.out_of_memory import memory_bounded
 from kfvo_ros.backbones.vggt.packing import pack
 from kfvo_ros.backbones.vggt.precision import PRECISIONS, choose_device, choose_dtype
@@ -88,9 +88,7 @@ def _compare(arguments: argparse.Namespace, device: torch.device) -> None:
     plain = ours if arguments.against == 'same' else Scene(
         random_model(device, torch.float32), *shape, autocast=official)
     times = _time(plain, ours, arguments.rounds)
-    multiplied = {'same': dtype, 'fp32': torch.float32,
-                  'official': torch.bfloat16}[arguments.against]
-    rates = {each: _matmul_rate(each, device, shape) for each in {dtype, multiplied}}
+    rates = {scene: _matmul_rate(scene) for scene in {plain, ours}}
     name = torch.cuda.get_device_name(device) if device.type == 'cuda' else \
         f'{torch.get_num_threads()} threads'
     print(f'{device} ({name}), torch {torch.__version__}, {shape[2]} frames of '
@@ -101,13 +99,13 @@ def _compare(arguments: argparse.Namespace, device: torch.device) -> None:
     for kind, flops in counts.items():
         median = statistics.median(times[kind])
         ratio = statistics.median(map(float.__truediv__, times['plain'], times[kind]))
-        rate = rates[multiplied if kind == 'plain' else dtype]
+        rate = rates[plain if kind == 'plain' else ours]
         print(f'{kind:12} {1e3 * median:9.1f} {ratio:5.2f}x {flops / 1e12:7.2f} '
               f'{flops / counts["plain"]:6.3f} {flops / median / rate:9.2f}')
     for kind in ('sliding', 'anchor kept'):
         print(f'{kind}: ' + ', '.join(f'{part} {100 * share:.1f} %'
                                       for part, share in _shares(ours, kind).items()))
-    print(f'matmul rate {rates[dtype] / 1e12:.3f} TFLOP/s, peak memory '
+    print(f'matmul rate {rates[ours] / 1e12:.3f} TFLOP/s, peak memory '
           f'{_peak_memory_mb(device):.0f} MiB')
 
 
@@ -159,18 +157,20 @@ def _timed(spent: dict[str, float], part: str, module: nn.Module,
             hook.remove()
 
 
-def _matmul_rate(dtype: torch.dtype, device: torch.device, shape: tuple[int, ...]) -> float:
-    """Return the operations per second of the model's largest multiplication [1/s]."""
-    width = VggtConfig().width
-    tokens = shape[2] * shape[0] * shape[1] // PATCH ** 2
-    x = torch.randn(tokens, width, device=device, dtype=dtype)
-    weight = torch.randn(4 * width, width, device=device, dtype=dtype)
+def _matmul_rate(scene: Scene) -> float:
+    """Return the operations per second of the model's largest matrix, in its layout [1/s]."""
+    block = scene.model.aggregator.global_blocks[0]
+    assert isinstance(block, Block)
+    frames, _, height, width = scene.images.shape
+    tokens = torch.randn(frames * height * width // PATCH ** 2, scene.model.config.width,
+                         device=scene.device)
     seconds = []
     for _ in range(8):
-        start = _now(device)
-        functional.linear(x, weight)
-        seconds.append(_now(device) - start)
-    return 2.0 * tokens * 4 * width ** 2 / statistics.median(seconds[1:])
+        start = _now(scene.device)
+        with scene.arithmetic():
+            hidden = block.mlp.fc1(tokens)
+        seconds.append(_now(scene.device) - start)
+    return 2.0 * tokens.numel() * hidden.shape[-1] / statistics.median(seconds[1:])
 
 
 def _now(device: torch.device) -> float:

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 
 import torch
 from torch import Tensor, nn
@@ -35,9 +35,13 @@ class Scene:
         self._fit = fit(height, width, width)
         self._window: list[FrameMemory] = []
 
+    def arithmetic(self) -> AbstractContextManager[object]:
+        """Return the context in which a plain step multiplies matrices."""
+        return torch.autocast(self.device.type, torch.bfloat16) if self.autocast else nullcontext()
+
     def plain(self) -> Tensor:
         """Place the window with nothing reused."""
-        with torch.autocast(self.device.type, torch.bfloat16) if self.autocast else nullcontext():
+        with self.arithmetic():
             features = self.model.aggregator(self.images[None])
         return self.model.camera_head(features.float())
 
