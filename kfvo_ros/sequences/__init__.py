@@ -50,4 +50,5 @@ def _detect(path: Path) -> str:
             return kind.name
     looks = '; '.join(kind.looks_like for kind in KINDS.values())
     problem = 'is no sequence that is known' if path.exists() else 'does not exist'
-    raise KfvoError(f'{path} {problem}; expected {looks}; or {SYNTHETIC}:SEED[:smooth|fast|mixed]')
+    raise KfvoError(f'{path} {problem}; expected {looks}; or '
+                    f'{SYNTHETIC}:SEED[:smooth|fast|mixed|street]')

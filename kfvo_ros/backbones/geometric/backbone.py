@@ -13,7 +13,6 @@ from kfvo_ros.backbones.base import (
     Backbone,
     Encoded,
     Estimate,
-    Points,
     Status,
     Stream,
     Window,
@@ -26,7 +25,7 @@ from kfvo_ros.backbones.geometric.memory import Memory, memory_of, recall
 from kfvo_ros.backbones.geometric.observations import View, tabulate
 from kfvo_ros.backbones.geometric.rolling_shutter import RollingShutter
 from kfvo_ros.backbones.geometric.signals import SIGNAL_NAMES, measure_motion, signals
-from kfvo_ros.backbones.geometric.window import MIN_INFORMATION, Solution, solve
+from kfvo_ros.backbones.geometric.window import Solution, solve
 from kfvo_ros.camera import Camera
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.images import to_grey
@@ -118,13 +117,13 @@ def _estimate(window: Window, stream: GeometricStream) -> Estimate:
                     Memory(history.views + views, poses, memory.measured or solution.measured,
                            memory.windows + 1,
                            _lens(memory, solution, views, stream.camera),
-                           _trusted(memory, solution.points)))
+                           _trusted(memory, solution)))
 
 
-def _trusted(memory: Memory, points: Points) -> np.ndarray:
+def _trusted(memory: Memory, solution: Solution) -> np.ndarray:
     """Return the ids of those points whose depths are measured well, or once were."""
-    return points.ids[(points.information > MIN_INFORMATION)
-                      | np.isin(points.ids, memory.trusted)]
+    ids = solution.points.ids
+    return ids[solution.well_known | np.isin(ids, memory.trusted)]
 
 
 def _lens(memory: Memory, solution: Solution, views: tuple[View, ...], camera: Camera) -> Lens:

@@ -41,8 +41,8 @@ LEAST_PRIOR_SPREAD = 0.2
 the median's."""
 SUSPICIOUS_SHARE = 0.5
 """When fewer of the newest frame's tracks fit, its first place may have been wrong."""
-MIN_INFORMATION = 10.0
-"""The median depth is known to 32 % from tracks good to a pixel: worth to be held on to."""
+WELL_KNOWN = 0.1
+"""A depth whose standard deviation is no larger a share of it is worth to be held on to."""
 MIN_PIVOT_RATIO = 1e-6
 """A system whose Cholesky factor has pivots further apart leaves directions undetermined."""
 LEAST_NOISE = 0.1
@@ -79,7 +79,12 @@ class Solution:
     @property
     def measured(self) -> bool:
         """Whether depths are measured well enough to be held on to."""
-        return self.median_information > MIN_INFORMATION
+        return self.median_information * WELL_KNOWN ** 2 > self.noise ** 2
+
+    @property
+    def well_known(self) -> np.ndarray:
+        """Mask (N,) of the points whose own depths are."""
+        return np.asarray(self.points.information * WELL_KNOWN ** 2 > self.noise ** 2)
 
     @cached_property
     def median_information(self) -> float:
