@@ -36,7 +36,7 @@ MAX_REJECTIONS = 5
 MIN_IMPROVEMENT = 1e-3
 """A step that lowers the cost by a smaller share is the last one."""
 LEAST_INVERSE_DEPTH = 1e-4
-POSE, LENS, POINT = 6, 2, 3
+POSE, LENS, POINT = 6, 5, 3
 """So many numbers each: what a residual depends on, in the order of its derivatives."""
 WIDE_ANGLE = 2.0
 """|x|^2 ends here, 55 degrees off the axis: at the rim of a fisheye a lens that is a little
@@ -118,7 +118,7 @@ def _weigh(problem: Problem, j: int, view: np.ndarray) -> None:
 
 @compiled
 def _differentiate_by_pose(points: np.ndarray, view: np.ndarray, J: np.ndarray) -> None:
-    """Fill J[:, :POSE], the derivatives of the weighed residuals by the pose of their frame."""
+    """Fill J (POSE, 2, P), the derivatives of the weighed residuals by the pose of their frame."""
     for k in range(view.shape[1]):
         u, v, focal = view[0, k], view[1, k], view[5, k]
         J[0, 0, k], J[0, 1, k] = focal * u * v, focal * (1.0 + v * v)
@@ -133,18 +133,22 @@ def _differentiate_by_pose(points: np.ndarray, view: np.ndarray, J: np.ndarray) 
 
 @compiled
 def _differentiate_by_lens(view: np.ndarray, J: np.ndarray) -> None:
-    """Fill J[:, POSE:POSE + LENS]."""
+    """Fill J (LENS, 2, P)."""
     for k in range(view.shape[1]):
         u, v, focal = view[0, k], view[1, k], view[5, k]
         off_axis = min(u * u + v * v, WIDE_ANGLE)
-        J[6, 0, k], J[6, 1, k] = focal * u, focal * v
-        J[7, 0, k], J[7, 1, k] = off_axis * focal * u, off_axis * focal * v
+        J[0, 0, k], J[0, 1, k] = focal * u, focal * v
+        J[1, 0, k], J[1, 1, k] = off_axis * focal * u, off_axis * focal * v
+        J[2, 0, k] = off_axis * off_axis * focal * u
+        J[2, 1, k] = off_axis * off_axis * focal * v
+        J[3, 0, k], J[3, 1, k] = focal, 0.0
+        J[4, 0, k], J[4, 1, k] = 0.0, focal
 
 
 @compiled
 def _differentiate_by_point(R: np.ndarray, t: np.ndarray, slopes: np.ndarray, view: np.ndarray,
                             J: np.ndarray) -> None:
-    """Fill J[:, POSE + LENS:] in a frame at (R, t)."""
+    """Fill J (POINT, 2, P) in a frame at (R, t)."""
     for m in range(POINT):
         t0, t1, t2 = (t[0], t[1], t[2]) if m == 2 else (0.0, 0.0, 0.0)
         for k in range(view.shape[1]):
@@ -152,16 +156,16 @@ def _differentiate_by_point(R: np.ndarray, t: np.ndarray, slopes: np.ndarray, vi
             along, focal = R[0, 2] * a + R[1, 2] * b + R[2, 2] * c, view[5, k] * view[2, k]
             across = R[0, 0] * a + R[1, 0] * b + R[2, 0] * c
             down = R[0, 1] * a + R[1, 1] * b + R[2, 1] * c
-            J[8 + m, 0, k] = focal * (across - view[0, k] * along)
-            J[8 + m, 1, k] = focal * (down - view[1, k] * along)
+            J[m, 0, k] = focal * (across - view[0, k] * along)
+            J[m, 1, k] = focal * (down - view[1, k] * along)
 
 
 @compiled
 def _add_points(J: np.ndarray, view: np.ndarray, H_pp: np.ndarray, g_p: np.ndarray) -> None:
-    """Add what a frame says of points by themselves."""
+    """Add what a frame says of points by themselves; J (POINT, 2, P) is by them."""
     for k in range(view.shape[1]):
-        x0, x1, y0, y1 = J[8, 0, k], J[8, 1, k], J[9, 0, k], J[9, 1, k]
-        r0, r1, e0, e1 = J[10, 0, k], J[10, 1, k], view[3, k], view[4, k]
+        x0, x1, y0, y1 = J[0, 0, k], J[0, 1, k], J[1, 0, k], J[1, 1, k]
+        r0, r1, e0, e1 = J[2, 0, k], J[2, 1, k], view[3, k], view[4, k]
         H_pp[0, k] += x0 * x0 + x1 * x1
         H_pp[1, k] += y0 * x0 + y1 * x1
         H_pp[2, k] += y0 * y0 + y1 * y1
@@ -174,21 +178,21 @@ def _add_points(J: np.ndarray, view: np.ndarray, H_pp: np.ndarray, g_p: np.ndarr
 
 
 @compiled
-def _add_coupling(J: np.ndarray, m: int, H_mp: np.ndarray) -> None:
-    """Add the products of J_m with the derivatives by the points, (3, P)."""
-    for k in range(J.shape[2]):
-        first, second = J[m, 0, k], J[m, 1, k]
-        H_mp[0, k] += first * J[8, 0, k] + second * J[8, 1, k]
-        H_mp[1, k] += first * J[9, 0, k] + second * J[9, 1, k]
-        H_mp[2, k] += first * J[10, 0, k] + second * J[10, 1, k]
+def _add_coupling(J_m: np.ndarray, J: np.ndarray, H_mp: np.ndarray) -> None:
+    """Add the products of J_m (2, P) with the derivatives J by the points, (3, P)."""
+    for k in range(J_m.shape[1]):
+        first, second = J_m[0, k], J_m[1, k]
+        H_mp[0, k] += first * J[0, 0, k] + second * J[0, 1, k]
+        H_mp[1, k] += first * J[1, 0, k] + second * J[1, 1, k]
+        H_mp[2, k] += first * J[2, 0, k] + second * J[2, 1, k]
 
 
 @compiled
 def linearise(problem: Problem, state: State, with_lens: bool) -> NormalEquations:
     """Return the normal equations at `state`, priors included.
 
-    With the lens they have two rows more: by what share points lie farther off the axis, and by
-    what share of their squared distance from it; both are zero now.
+    With the lens they have LENS rows more, of what is zero now: by what share points lie farther
+    off the axis, by what share times r^2 and r^4, r off it, and where the axis is.
     """
     (frames, points), fixed = problem.mask.shape, problem.fixed
     poses = POSE * (frames - fixed)
@@ -196,6 +200,7 @@ def linearise(problem: Problem, state: State, with_lens: bool) -> NormalEquation
     H_cc, g_c, H_cp = np.zeros((size, size)), np.zeros(size), np.zeros((size, POINT, points))
     H_pp, g_p = np.zeros((6, points)), np.zeros((POINT, points))
     view, J = np.empty((6, points)), np.empty((POSE + LENS + POINT, 2, points))
+    by_pose, by_lens, by_point = J[:POSE], J[POSE:POSE + LENS], J[POSE + LENS:]
     rows, residuals = J.reshape(len(J), 2 * points), view[3:5].reshape(2 * points)
     lifted, slopes = _lift(problem, state.points)
     for k in range(points):
@@ -204,21 +209,22 @@ def linearise(problem: Problem, state: State, with_lens: bool) -> NormalEquation
     for j in range(frames):
         _project(problem, state, lifted, j, view)
         _weigh(problem, j, view)
-        _differentiate_by_point(state.rotations[j], state.translations[j], slopes, view, J)
-        _add_points(J, view, H_pp, g_p)
+        _differentiate_by_point(state.rotations[j], state.translations[j], slopes, view,
+                                by_point)
+        _add_points(by_point, view, H_pp, g_p)
         pose = POSE * (j - fixed)
         if j >= fixed:
-            _differentiate_by_pose(state.points, view, J)
+            _differentiate_by_pose(state.points, view, by_pose)
             add_products(rows[:POSE], 1.0, H_cc[pose:pose + POSE, pose:pose + POSE])
             for m in range(POSE):
                 g_c[pose + m] = dot(rows[m], residuals)
-                _add_coupling(J, m, H_cp[pose + m])
+                _add_coupling(J[m], by_point, H_cp[pose + m])
         if with_lens:
-            _differentiate_by_lens(view, J)
+            _differentiate_by_lens(view, by_lens)
             for m in range(POSE, POSE + LENS):
                 row = poses + m - POSE
                 g_c[row] += dot(rows[m], residuals)
-                _add_coupling(J, m, H_cp[row])
+                _add_coupling(J[m], by_point, H_cp[row])
                 for n in range(0 if j >= fixed else POSE, m + 1):
                     column = pose + n if n < POSE else poses + n - POSE
                     H_cc[row, column] += dot(rows[m], rows[n])

@@ -2,11 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a calibration left of the lens, learnt on the way.
 
-Rectified datasets and hurried calibrations are a few pixels off at the rim. In one window that
-hides among the noise, but it is the same in every window: the scale drifts along each street and
-jumps in each turn. So solved windows are asked what they say of the lens, again and again within a
-turn, for it tells most, and the answers are weighed against each other and against the
-calibration: a Kalman filter of something that does not move.
+Rectified datasets and hurried calibrations are a few pixels off, at the rim or everywhere. In one
+window that hides among the noise, but it is the same in every window: the scale drifts along each
+street and jumps in each turn. So solved windows are asked what they say of the lens, again and
+again within a turn, for it tells most, and the answers are weighed against each other and against
+the calibration: a Kalman filter of something that does not move. Of what is wrong with lenses
+nothing large may be left out, or it is laid to the focal length.
 """
 
 from __future__ import annotations
@@ -20,9 +21,10 @@ from kfvo_ros.backbones.geometric import bundle_adjustment as ba
 from kfvo_ros.backbones.geometric.problem import Problem, State
 from kfvo_ros.backbones.geometric.schur import reduce
 
-EXPECTED = 0.005
-"""One standard deviation of a calibration's error: by this share points lie elsewhere, near the
-axis and, in addition, at 45 degrees off it."""
+EXPECTED = (0.005, 0.005, 0.001, 0.001, 0.001)
+"""Standard deviations of a calibration's errors: by this share points lie elsewhere near the axis
+and, in addition, at 45 degrees off it, by the square and the fourth power of the distance; and so
+many focal lengths the axis lies elsewhere."""
 ASKED_AGAIN = 0.25
 """A window is asked once so large a share of its frames is new; it counts by that share."""
 LEAST_VIEWS = 4
@@ -33,25 +35,26 @@ that are alike say less than independent ones would, more so where every frame i
 
 
 def _calibrated() -> np.ndarray:
-    return np.eye(2) / EXPECTED ** 2
+    return np.diag(1.0 / np.square(EXPECTED))
 
 
 @dataclass(frozen=True)
 class Lens:
-    """Points lie at x / (1 + e0 + e1 r^2) where the calibration says x, r off the axis.
+    """Points lie at (x - c) / (1 + e0 + e1 r^2 + e2 r^4) where the calibration says x.
 
-    ``errors`` (2,) are e and ``information`` (2, 2) is theirs; ``asked`` is the index of the
-    newest view that was asked.
+    ``errors`` (5,) are e and the axis c, ``information`` (5, 5) is theirs; r is off the axis;
+    ``asked`` is the index of the newest view that was asked.
     """
 
-    errors: np.ndarray = field(default_factory=lambda: np.zeros(2))
+    errors: np.ndarray = field(default_factory=lambda: np.zeros(len(EXPECTED)))
     information: np.ndarray = field(default_factory=_calibrated)
     asked: int = -1
 
     def straighten(self, points: np.ndarray) -> np.ndarray:
         """Return where points (N, 2) lie, normalised as they are."""
-        near_axis, off_axis = self.errors
-        return points / (1.0 + near_axis + off_axis * _off_axis(points))[:, None]
+        near_axis, square, fourth, *axis = self.errors
+        r2 = _off_axis(points)
+        return (points - axis) / (1.0 + near_axis + square * r2 + fourth * r2 * r2)[:, None]
 
     def new_in(self, indices: Sequence[int]) -> float:
         """Return the share of a window's frames, by their indices, that were not asked yet."""
@@ -76,7 +79,7 @@ def _off_axis(points: np.ndarray) -> np.ndarray:
 
 
 def marginal(problem: Problem, state: State) -> tuple[np.ndarray, np.ndarray]:
-    """Return information (2, 2) on the errors of the lens, and its pull (2,) on them.
+    """Return information (5, 5) on the errors of the lens, and its pull (5,) on them.
 
     Both are by the longer tracks, off by 1 px, all else set free but the first frame; the errors
     are most likely information^-1 @ pull. Scale is held by what is expected of depths.
