@@ -11,7 +11,7 @@ from functools import lru_cache
 import numpy as np
 
 from kfvo_ros import geometry
-from kfvo_ros.backbones.base import Backbone, Encoded
+from kfvo_ros.backbones.base import Backbone, Encoded, Window
 from kfvo_ros.backbones.geometric.backbone import GeometricBackbone
 from kfvo_ros.backbones.geometric.observations import View
 from kfvo_ros.camera import Camera
@@ -55,6 +55,14 @@ class PointCloud:
         view = View(index, tracks, CAMERA.undistort(tracks.pixels))
         descriptor = np.full(48, index, dtype=np.float32)
         return Encoded(index * RATE_NS, descriptor, view, tracks)
+
+
+def window(poses: np.ndarray, seed: int = 0, noise: float = 0.0,
+           backbone: GeometricBackbone | None = None) -> Window:
+    """Return the window of a new stream that knows nothing of earlier ones."""
+    cloud = PointCloud(seed, noise=noise)
+    frames = tuple(cloud.encode(index, pose) for index, pose in enumerate(poses))
+    return Window((backbone or GeometricBackbone()).open(CAMERA), frames)
 
 
 def moving_poses(count: int, step: float = 0.15) -> np.ndarray:

@@ -6,7 +6,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from odometry_scenes import CAMERA, PointCloud, frames_of, moving_poses, run, turning_poses
+from odometry_scenes import (
+    CAMERA,
+    PointCloud,
+    frames_of,
+    moving_poses,
+    run,
+    turning_poses,
+    window,
+)
 
 from kfvo_ros import geometry
 from kfvo_ros.backbones.base import Estimate, Previous, Status, Window
@@ -18,14 +26,6 @@ from kfvo_ros.keyframes.heuristics import Survival
 from kfvo_ros.odometry import KeyframeOdometry
 from kfvo_ros.sequences.synthetic import SyntheticSequence
 from kfvo_ros.tracking import Tracks, common
-
-
-def window(poses: np.ndarray, seed: int = 0, noise: float = 0.0,
-           backbone: GeometricBackbone | None = None) -> Window:
-    """Return the window of a new stream that knows nothing of earlier ones."""
-    cloud = PointCloud(seed, noise=noise)
-    frames = tuple(cloud.encode(index, pose) for index, pose in enumerate(poses))
-    return Window((backbone or GeometricBackbone()).open(CAMERA), frames)
 
 
 def followed(backbone: GeometricBackbone, poses: np.ndarray, noise: float) -> Window:

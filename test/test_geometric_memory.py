@@ -5,9 +5,8 @@
 from __future__ import annotations
 
 import pytest
-from odometry_scenes import CAMERA, PointCloud, moving_poses, turning_poses
+from odometry_scenes import moving_poses, turning_poses, window
 
-from kfvo_ros.backbones.base import Window
 from kfvo_ros.backbones.geometric.backbone import GeometricBackbone
 
 
@@ -16,10 +15,8 @@ from kfvo_ros.backbones.geometric.backbone import GeometricBackbone
     (moving_poses(8, 0.25), 1.0, True), (turning_poses(8), 0.3, False)])
 def test_noise_does_not_pass_for_a_measurement(poses, noise, measured):
     """Depths are known by how far the camera moved, and by how far the tracks are off."""
-    backbone = GeometricBackbone()
     for seed in range(3):
-        cloud = PointCloud(seed, noise=noise)
-        frames = tuple(cloud.encode(index, pose) for index, pose in enumerate(poses))
-        memory = backbone.estimate([Window(backbone.open(CAMERA), frames)])[0].memory
+        seen = window(poses, seed, noise)
+        memory = GeometricBackbone().estimate([seen])[0].memory
         assert memory.measured == measured
-        assert (len(memory.trusted) > 0.5 * len(frames[0].tracks)) == measured
+        assert (len(memory.trusted) > 0.5 * len(seen.frames[0].tracks)) == measured

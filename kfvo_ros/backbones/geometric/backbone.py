@@ -9,15 +9,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from kfvo_ros.backbones.base import (
-    Backbone,
-    Encoded,
-    Estimate,
-    Status,
-    Stream,
-    Window,
-    lost,
-)
+from kfvo_ros.backbones.base import Backbone, Encoded, Estimate, Status, Stream, Window, lost
 from kfvo_ros.backbones.geometric import kernels
 from kfvo_ros.backbones.geometric.initialisation import Initialiser
 from kfvo_ros.backbones.geometric.lens import ASKED_AGAIN, Lens

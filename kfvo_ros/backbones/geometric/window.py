@@ -79,12 +79,17 @@ class Solution:
     @property
     def measured(self) -> bool:
         """Whether depths are measured well enough to be held on to."""
-        return self.median_information * WELL_KNOWN ** 2 > self.noise ** 2
+        return self.median_information > self._enough
 
     @property
     def well_known(self) -> np.ndarray:
         """Mask (N,) of the points whose own depths are."""
-        return np.asarray(self.points.information * WELL_KNOWN ** 2 > self.noise ** 2)
+        return self.points.information > self._enough
+
+    @property
+    def _enough(self) -> float:
+        """Information on a depth that is well known from tracks as noisy as these."""
+        return (self.noise / WELL_KNOWN) ** 2
 
     @cached_property
     def median_information(self) -> float:
