@@ -191,7 +191,7 @@ def test_best_effort_subscribers_get_the_last_message_too(bags):
     from rclpy.qos import qos_profile_sensor_data
     with Listener({CAM0: sensor_msgs.Image}, qos_profile_sensor_data) as listener:
         played(run_module(PLAY, bags['mcap'], '--wait-for-subscribers'))
-        wait_until(lambda: stamps(listener, CAM0)[-1] == STAMPS_NS[-1])
+        wait_until(lambda: stamps(listener, CAM0)[-1:] == STAMPS_NS[-1:])
 
 
 def test_topics_that_cannot_be_published_are_left_out(tmp_path):
