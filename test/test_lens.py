@@ -171,12 +171,28 @@ def test_a_wrong_calibration_is_found_out(k1, cx, share):
         found = backbone.memories[-1].lens
         if readout_s:
             assert found.asked == -1, 'what a rolling shutter does would be laid to the lens'
+            assert all(update.intrinsics is None for update in result.updates)
         else:
             axis = -cx / SEQUENCE.camera.fx
             assert abs(found.errors[1] + k1) < 0.3 * K1
             assert abs(found.errors[0]) < 0.005
             assert abs(found.errors[3] - axis) < 0.0015
     assert errors[0.0] < share * errors[1e-9]
+
+
+def test_the_focal_length_is_told_once_it_is_known():
+    true = SEQUENCE.camera
+    wrong = replace(true, fx=1.01 * true.fx, fy=1.01 * true.fy)
+    seen = [update.intrinsics for update in run(frames(wrong), Survival()).updates]
+    assert all(K is None for K in seen[:8])
+    assert np.allclose(seen[-1], true.matrix, rtol=0.004)
+
+
+def test_intrinsics_put_straightened_points_where_the_calibration_saw_them():
+    lens, points = Lens(np.array([0.01, 0.0, 0.0, 0.002, -0.001])), np.array([[0.3, -0.2]])
+    ray = np.append(lens.straighten(points), 1.0)
+    np.testing.assert_allclose(lens.intrinsics(CAMERA) @ ray,
+                               CAMERA.matrix @ np.append(points, 1.0), rtol=1e-12)
 
 
 def test_a_right_calibration_is_left_alone():

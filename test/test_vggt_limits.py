@@ -44,7 +44,7 @@ def bounded(step, spare):
         resource.setrlimit(resource.RLIMIT_AS, (resource.RLIM_INFINITY,) * 2)
 
 M_MMAP_THRESHOLD = -3
-ctypes.CDLL(None).mallopt(M_MMAP_THRESHOLD, 1 << 16)  # What is freed is gone: spare is all there is.
+ctypes.CDLL(None).mallopt(M_MMAP_THRESHOLD, 1 << 16)  # What is freed is gone, not to be had again.
 told, MiB = [], 1 << 20
 torch.set_num_threads(1)
 backbone, half = (VggtBackbone(changed(small_model(), dtype), 518)

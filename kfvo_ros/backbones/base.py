@@ -103,7 +103,7 @@ class Estimate:
     unit per window; ``make_covariance`` returns what ``covariance`` is; ``points`` or None;
     ``signals`` (len(signal_names),) float32 for the policy; ``status`` of the newest frame;
     ``memory`` comes back in the next `Previous`; ``intrinsics`` K (3, 3) of the newest image [px]
-    from a model that estimates them; ``durations`` [s] of parts of the call that people compare,
+    from those that estimate them; ``durations`` [s] of parts of the call that people compare,
     such as ``head``, of a batch the window's share.
     """
 

@@ -103,13 +103,13 @@ def _estimate(window: Window, stream: GeometricStream) -> Estimate:
     if solution.problem.mask[-1].sum() < MIN_TRACKS or not np.isfinite(poses).all():
         return lost(window, len(SIGNAL_NAMES), Memory())
     motion = measure_motion(solution, views[-2], views[-1], stream.initialiser.focal)
+    lens = _lens(memory, solution, views, stream.camera)
     return Estimate(poses[solution.anchor:], solution.covariance, solution.points,
                     signals(solution, motion),
                     Status.HELD if motion.window_parallax < HELD_PARALLAX else Status.OK,
                     Memory(history.views + views, poses, memory.measured or solution.measured,
-                           memory.windows + 1,
-                           _lens(memory, solution, views, stream.camera),
-                           _trusted(memory, solution)))
+                           memory.windows + 1, lens, _trusted(memory, solution)),
+                    lens.intrinsics(stream.camera) if lens.known else None)
 
 
 def _trusted(memory: Memory, solution: Solution) -> np.ndarray:

@@ -14,12 +14,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
 from kfvo_ros.backbones.geometric import bundle_adjustment as ba
 from kfvo_ros.backbones.geometric.problem import Problem, State
 from kfvo_ros.backbones.geometric.schur import reduce
+from kfvo_ros.camera import Camera
 
 EXPECTED = (0.005, 0.005, 0.001, 0.001, 0.001)
 """Standard deviations of a calibration's errors: by this share points lie elsewhere near the axis
@@ -32,6 +34,8 @@ LEAST_VIEWS = 4
 ALIKE = 0.7
 """How a track's errors in two successive frames correlate; g frames apart it is ALIKE^g. Errors
 that are alike say less than independent ones would, more so where every frame is a keyframe."""
+KNOWN = 0.5
+"""A focal length is worth telling once it is this share as doubtful as the calibration's was."""
 
 
 def _calibrated() -> np.ndarray:
@@ -59,6 +63,17 @@ class Lens:
     def new_in(self, indices: Sequence[int]) -> float:
         """Return the share of a window's frames, by their indices, that were not asked yet."""
         return sum(index > self.asked for index in indices) / len(indices)
+
+    @cached_property
+    def known(self) -> bool:
+        """Whether more is known of the focal length than the calibration says."""
+        variance = np.linalg.inv(self.information)[0, 0]
+        return bool(variance < (KNOWN * EXPECTED[0]) ** 2)
+
+    def intrinsics(self, camera: Camera) -> np.ndarray:
+        """Return K (3, 3) [px] as it is, near the axis, of a camera with this calibration."""
+        larger, (x, y) = 1.0 + self.errors[0], self.errors[-2:]
+        return camera.matrix @ [[larger, 0.0, x], [0.0, larger, y], [0.0, 0.0, 1.0]]
 
     def told(self, problem: Problem, state: State, noise: float, indices: Sequence[int]) -> Lens:
         """Return what is known after a window, straightened by this lens, has been solved.
