@@ -3,10 +3,12 @@
 """Find the points of one image in the next: pyramidal Lucas-Kanade, searched, checked, refined.
 
 A wide patch is what finds a point again, but it averages over surfaces that move differently. A
-narrow one, started where the wide one ended, follows the point itself.
+narrow one, started where the wide one ended, follows the point itself, or more nearly so.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -22,9 +24,20 @@ MAX_REFINEMENT = 2.0
 """... or when the narrow patch disagrees with the wide one by more [px]."""
 
 
+class Matches(NamedTuple):
+    """Points found again at ``places`` (N, 2) under the mask ``found`` (N,).
+
+    ``parted`` (N, 2) is the way from where their wide patches ended to their narrow ones [px].
+    """
+
+    places: np.ndarray
+    found: np.ndarray
+    parted: np.ndarray
+
+
 def follow(last: np.ndarray, image: np.ndarray, points: np.ndarray,
-           predicted: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Return where points (N, 2) of `last` are in `image`, and a mask (N,) of those found.
+           predicted: np.ndarray | None = None) -> Matches:
+    """Find points (N, 2) of `last` in `image`.
 
     Images are (H, W) uint8 of one size; `predicted` (N, 2) is where the search starts, else the
     points themselves are and it reaches farther.
@@ -37,10 +50,12 @@ def follow(last: np.ndarray, image: np.ndarray, points: np.ndarray,
     rows = np.flatnonzero(found)
     start, wide = start[rows], end[rows]
     narrow, refined = _match(last, image, start, wide, REFINEMENT)
-    refined &= np.linalg.norm(narrow - wide, axis=1) < MAX_REFINEMENT
+    parted = np.zeros(end.shape)
+    parted[rows] = narrow - wide
+    refined &= np.linalg.norm(parted[rows], axis=1) < MAX_REFINEMENT
     refined &= _returns(last, image, start, narrow, REFINEMENT)
     end[rows], found[rows] = narrow, refined
-    return end.astype(np.float64), found
+    return Matches(end.astype(np.float64), found, parted)
 
 
 def _returns(last: np.ndarray, image: np.ndarray, start: np.ndarray, end: np.ndarray,

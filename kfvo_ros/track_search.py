@@ -17,6 +17,7 @@ import numpy as np
 
 from kfvo_ros import motion_field, optical_flow
 from kfvo_ros.motion_field import MotionField
+from kfvo_ros.optical_flow import Matches
 
 ENOUGH = 0.4
 """When a smaller share of the points is found the guess was wrong: noise finds every fourth."""
@@ -42,22 +43,18 @@ class TrackSearch:
         self._shift = np.zeros(2)
         self._bias = np.zeros(2)
 
-    def find_again(self, last: np.ndarray, image: np.ndarray,
-                   points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return where points (N, 2) of `last` are in `image`, and a mask (N,) of those found.
-
-        Images are (H, W) uint8 of one size.
-        """
-        after, found = points.copy(), np.zeros(len(points), dtype=bool)
+    def find_again(self, last: np.ndarray, image: np.ndarray, points: np.ndarray) -> Matches:
+        """Find points (N, 2) of `last` in `image`, which are (H, W) uint8 of one size."""
+        best = Matches(points.copy(), np.zeros(len(points), dtype=bool), np.zeros(points.shape))
         for start in self._guesses(last, image, points):
             candidates = optical_flow.follow(last, image, points, start)
-            if candidates[1].sum() > found.sum():
-                after, found = candidates
-            if found.mean() >= ENOUGH:
+            if candidates.found.sum() > best.found.sum():
+                best = candidates
+            if best.found.mean() >= ENOUGH:
                 break
-        if ENOUGH <= found.mean() < MOST:
-            _find_rest(last, image, points, after, found)
-        return after, found
+        if ENOUGH <= best.found.mean() < MOST:
+            _find_rest(last, image, points, best)
+        return best
 
     def learn(self, before: np.ndarray, after: np.ndarray, size: np.ndarray) -> None:
         """Take in how tracks (N, 2) moved in the images searched last, of this size (2,) [px]."""
@@ -100,13 +97,15 @@ def whole_shift(last: np.ndarray, image: np.ndarray, field: MotionField | None) 
     return SHRINKING * np.array(shift)
 
 
-def _find_rest(last: np.ndarray, image: np.ndarray, points: np.ndarray, after: np.ndarray,
-               found: np.ndarray) -> None:
-    """Look for the points not found where the others' motion leads; fill `after` and `found`."""
-    size = np.array(image.shape[::-1])
-    field = motion_field.fit(points[found], (after - points)[found], size)
+def _find_rest(last: np.ndarray, image: np.ndarray, points: np.ndarray,
+               matches: Matches) -> None:
+    """Look for the points not found where the others' motion leads; fill `matches`."""
+    size, found = np.array(image.shape[::-1]), matches.found
+    field = motion_field.fit(points[found], (matches.places - points)[found], size)
     if field is None:
         return
     start = points + field.at(points)
     rest = np.flatnonzero(~found & ((start >= 0) & (start < size)).all(axis=1))
-    after[rest], found[rest] = optical_flow.follow(last, image, points[rest], start[rest])
+    for of_all, of_rest in zip(matches, optical_flow.follow(last, image, points[rest],
+                                                            start[rest]), strict=True):
+        of_all[rest] = of_rest

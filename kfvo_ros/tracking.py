@@ -4,6 +4,11 @@
 
 Tracks never depend on keyframe decisions, so a sequence can be tracked once and any policy run
 on the result.
+
+A patch over the rim of something near follows near and far at once, and slides off the point it
+was set on; the wider it is, the more. Noise parts a wide patch from the narrow one within it to
+all sides, sliding always to the same. What gathers of that tells how far a track has slid, and
+how far to trust it.
 """
 
 from __future__ import annotations
@@ -15,19 +20,23 @@ import numpy as np
 
 from kfvo_ros.camera import Camera
 from kfvo_ros.corners import find_corners
+from kfvo_ros.optical_flow import Matches
 from kfvo_ros.track_ids import shared
 from kfvo_ros.track_search import TrackSearch
 
 FEATURES = 400
 CLAHE_CLIP, CLAHE_TILES = 3.0, (8, 8)
 RIM = 4
-"""Tracks end this close to the rim [px]."""
+"""Patches are followed no closer to the rim [px]."""
 
 MAX_EPIPOLAR_ERROR = 1.5
 RANSAC_CONFIDENCE, RANSAC_ITERATIONS = 0.99, 300
 MIN_RANSAC_TRACKS = 16
 MIN_INLIER_SHARE = 0.4
 """Below it the consensus is chance, and nothing is dropped for disagreeing with it."""
+
+SLIDING = 0.2
+"""The narrow patch slides by this share of what it and the wide one part by."""
 
 MIN_SURVIVORS = 12
 """With fewer, the frame is taken for a flash, a shutter or a cut."""
@@ -37,17 +46,56 @@ MAX_BLINKS = 3
 
 @dataclass(frozen=True)
 class Tracks:
-    """What is seen in one frame: ``ids`` (N,) int64, increasing, at ``pixels`` (N, 2)."""
+    """What is seen in one frame: ``ids`` (N,) int64, increasing, at ``pixels`` (N, 2).
+
+    ``doubts`` (N,) are by how much their patches part from frame to frame [px].
+    """
 
     ids: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     pixels: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
+    doubts: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     def __len__(self) -> int:
         return len(self.ids)
 
     def select(self, mask: np.ndarray) -> Tracks:
         """Return the tracks under a boolean mask or at sorted indices."""
-        return Tracks(self.ids[mask], self.pixels[mask])
+        return Tracks(self.ids[mask], self.pixels[mask], self.doubts[mask])
+
+
+@dataclass(frozen=True)
+class _Trails:
+    """Corners followed for ``frames`` (N,), in which their patches came to ``places`` (N, 2).
+
+    ``parted`` (N, 2) is the sum of the ways from wide patches to narrow ones [px].
+    """
+
+    ids: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    places: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
+    parted: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
+    frames: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def followed(self, matches: Matches) -> _Trails:
+        """Return those of the trails that were found again, one frame on."""
+        found = matches.found
+        return _Trails(self.ids[found], matches.places[found],
+                      self.parted[found] + matches.parted[found], self.frames[found] + 1)
+
+    def joined(self, first_id: int, corners: np.ndarray) -> _Trails:
+        """Return the trails and new ones that begin at corners (M, 2)."""
+        count = len(corners)
+        return _Trails(np.concatenate([self.ids, first_id + np.arange(count)]),
+                      np.concatenate([self.places, corners]),
+                      np.concatenate([self.parted, np.zeros((count, 2))]),
+                      np.concatenate([self.frames, np.zeros(count, dtype=np.int64)]))
+
+    def tracks(self) -> Tracks:
+        """Return where the points are that the patches were set on, as far as can be told."""
+        doubts = np.linalg.norm(self.parted, axis=1) / np.maximum(self.frames, 1)
+        return Tracks(self.ids, self.places + SLIDING * self.parted, doubts)
 
 
 def common(a: Tracks, b: Tracks) -> tuple[np.ndarray, np.ndarray]:
@@ -74,7 +122,7 @@ class Tracker:
         self._ransac = _ransac(seed)
         self._equaliser = cv2.createCLAHE(CLAHE_CLIP, CLAHE_TILES)
         self._image: np.ndarray | None = None
-        self._tracks = Tracks()
+        self._trails = _Trails()
         self._search = TrackSearch()
         self._next_id = 0
         self._blinks = 0
@@ -87,27 +135,28 @@ class Tracker:
         """
         image = self._equaliser.apply(grey)
         survivors = self._follow(self._image, image)
-        gone = len(survivors) < MIN_SURVIVORS <= len(self._tracks)
+        gone = len(survivors) < MIN_SURVIVORS <= len(self._trails)
         if gone and self._blinks < MAX_BLINKS:
             self._blinks += 1
             return Tracks()
         self._blinks = 0
         self._image = image
-        self._tracks = self._refill(image, survivors)
-        return self._tracks
+        self._trails = self._refill(image, survivors)
+        return self._trails.tracks()
 
-    def _follow(self, last: np.ndarray | None, image: np.ndarray) -> Tracks:
+    def _follow(self, last: np.ndarray | None, image: np.ndarray) -> _Trails:
         """Track the last image's corners into `image` and drop those that do not agree."""
-        if last is None or len(self._tracks) == 0 or image.shape != last.shape:
+        if last is None or len(self._trails) == 0 or image.shape != last.shape:
             self._search = TrackSearch()
-            return Tracks()
+            return _Trails()
         size = np.array(image.shape[::-1])
-        before = self._tracks.pixels
-        after, found = self._search.find_again(last, image, before)
-        found &= ((after >= RIM) & (after < size - RIM)).all(axis=1)
+        before = self._trails.places
+        matches = self._search.find_again(last, image, before)
+        after = matches.places
+        found = matches.found & ((after >= RIM) & (after < size - RIM)).all(axis=1)
         found[found] = self._agreeing(before[found], after[found])
         self._search.learn(before[found], after[found], size)
-        return Tracks(self._tracks.ids[found], after[found])
+        return self._trails.followed(matches._replace(found=found))
 
     def _agreeing(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
         """Return a mask (N,) of the pairs that follow one epipolar geometry."""
@@ -126,16 +175,15 @@ class Tracker:
             everyone[everyone] = inliers[:, 0] > 0
         return everyone
 
-    def _refill(self, image: np.ndarray, survivors: Tracks) -> Tracks:
+    def _refill(self, image: np.ndarray, survivors: _Trails) -> _Trails:
         """Add corners where there are no tracks, up to the wanted number."""
         missing = self._features - len(survivors)
         if missing < 0.1 * self._features:
             return survivors
-        corners = find_corners(image, survivors.pixels, missing)
-        ids = np.arange(self._next_id, self._next_id + len(corners))
+        corners = find_corners(image, survivors.places, missing)
+        trails = survivors.joined(self._next_id, corners)
         self._next_id += len(corners)
-        return Tracks(np.concatenate([survivors.ids, ids]),
-                      np.concatenate([survivors.pixels, corners]))
+        return trails
 
 
 def _ransac(seed: int) -> cv2.UsacParams:

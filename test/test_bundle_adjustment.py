@@ -47,8 +47,9 @@ def window(seed: int = 0, noise: float = 0.0, fixed: int = 1,
     mask &= np.arange(FRAMES)[:, None] >= hosts
     mask[-1] = True
     weights, values = np.full(POINTS, prior), points[2] * rng.uniform(0.8, 1.2, POINTS)
+    certainty = rng.uniform(0.3, 1.0, POINTS)
     problem = ba.Problem(hosts, origins, np.zeros((FRAMES, 2, POINTS)), mask, FOCAL, fixed,
-                         weights, values, WIDTH)
+                         certainty, weights, values, WIDTH)
     seen = project(problem, state)
     seen += noise / FOCAL * rng.normal(size=seen.shape)
     return problem._replace(seen=seen), state
@@ -206,7 +207,21 @@ def test_errors_are_those_of_what_is_seen():
     errors = ba.reprojection_errors(problem, state)
     assert not errors[~problem.mask].any()
     shift = np.linalg.norm(project(problem, state) - problem.seen, axis=1)
-    np.testing.assert_allclose(errors[problem.mask], FOCAL * shift[problem.mask], rtol=1e-9)
+    count_for = problem.certainty * FOCAL * shift
+    np.testing.assert_allclose(errors[problem.mask], count_for[problem.mask], rtol=1e-9)
+
+
+def test_points_that_are_doubted_count_less():
+    """A quarter of the points slides sideways, and says that the camera moved."""
+    problem, truth = window(fixed=FRAMES - 1)
+    sliding = np.arange(POINTS) % 4 == 0
+    seen = problem.seen.copy()
+    seen[-1, 0, sliding] += 1.0 / FOCAL
+    certainty = np.where(sliding, 0.1, 1.0)
+    off = [np.linalg.norm(ba.adjust(problem._replace(seen=seen, certainty=each), truth, 20)
+                          .translations[-1] - truth.translations[-1])
+           for each in (np.ones(POINTS), certainty)]
+    assert off[1] < 0.1 * off[0]
 
 
 def test_a_host_is_believed_no_more_than_others():
@@ -215,7 +230,7 @@ def test_a_host_is_believed_no_more_than_others():
     still = ba.State(np.tile(np.eye(3), (FRAMES, 1, 1)), np.zeros((FRAMES, 3)), truth.points)
     problem = problem._replace(origins=np.tile(np.eye(4), (FRAMES, 1, 1)), width=100.0,
                                hosts=np.zeros(POINTS, dtype=np.int64),
-                               mask=np.ones_like(problem.mask))
+                               mask=np.ones_like(problem.mask), certainty=np.ones(POINTS))
     noise = np.random.default_rng(3).choice([-1.0, 1.0], (2, POINTS)) / FOCAL
     seen = project(problem, still)
     seen[0] += noise

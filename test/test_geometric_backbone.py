@@ -12,6 +12,7 @@ from odometry_scenes import (
     frames_of,
     moving_poses,
     run,
+    sure,
     turning_poses,
     window,
 )
@@ -19,13 +20,11 @@ from odometry_scenes import (
 from kfvo_ros import geometry
 from kfvo_ros.backbones.base import Estimate, Previous, Status, Window
 from kfvo_ros.backbones.geometric.backbone import GeometricBackbone
-from kfvo_ros.backbones.geometric.lens import Lens
-from kfvo_ros.backbones.geometric.observations import tabulate
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.keyframes.heuristics import Survival
 from kfvo_ros.odometry import KeyframeOdometry
 from kfvo_ros.sequences.synthetic import SyntheticSequence
-from kfvo_ros.tracking import Tracks, common
+from kfvo_ros.tracking import common
 
 
 def followed(backbone: GeometricBackbone, poses: np.ndarray, noise: float) -> Window:
@@ -211,7 +210,7 @@ def test_a_frame_that_shares_nothing_is_lost_where_it_was():
     backbone = GeometricBackbone()
     hinted = followed(backbone, moving_poses(8), 0.2)
     newest = hinted.frames[-1]
-    others = Tracks(newest.tracks.ids + 10_000, newest.tracks.pixels)
+    others = sure(newest.tracks.ids + 10_000, newest.tracks.pixels)
     view = type(newest.payload)(7, others, newest.payload.points)
     strange = type(newest)(newest.stamp_ns, newest.descriptor, view, others)
     lost = backbone.estimate([Window(hinted.stream, (*hinted.frames[:-1], strange),
@@ -271,19 +270,3 @@ def test_streams_of_one_backbone_do_not_disturb_each_other():
 def test_a_camera_is_needed():
     with pytest.raises(KfvoError, match='calibrated camera'):
         GeometricBackbone().open(None)
-
-
-def test_table_lists_what_moving_frames_see():
-    cloud, poses = PointCloud(0), moving_poses(4)
-    views = [cloud.encode(index, pose).payload for index, pose in enumerate(poses)]
-    table = tabulate(views, 1, Lens())
-    assert (np.diff(table.ids) > 0).all()
-    assert (table.mask.sum(axis=1) >= 2).all()
-    assert table.mask[:, 2:].any(axis=1).all()
-    assert np.array_equal(table.hosts, table.mask.argmax(axis=1))
-    for frame, view in enumerate(views):
-        rows = np.flatnonzero(table.mask[:, frame])
-        columns = np.searchsorted(view.tracks.ids, table.ids[rows])
-        assert np.array_equal(table.seen[rows, frame], view.points[columns])
-    rows = np.arange(len(table))
-    assert np.array_equal(table.rays[:, :2], table.seen[rows, table.hosts])

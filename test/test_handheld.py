@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 
 import numpy as np
-from odometry_scenes import RATE_NS
+from odometry_scenes import RATE_NS, sure
 
 from kfvo_ros import geometry, metrics
 from kfvo_ros.backbones.base import Encoded
@@ -56,7 +56,7 @@ def tracks_of(rng: np.random.Generator, points: np.ndarray,
         count += len(born)
         rows = np.flatnonzero(ids >= 0)
         rows = rows[np.argsort(ids[rows])]
-        yield Tracks(ids[rows], pixels[rows] + NOISE * rng.normal(size=(len(rows), 2)))
+        yield sure(ids[rows], pixels[rows] + NOISE * rng.normal(size=(len(rows), 2)))
 
 
 def replay(tracks_in_turn: Iterable[Tracks]) -> Trajectory:

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from odometry_scenes import sure
 
 from kfvo_ros import geometry
 from kfvo_ros.keyframes import POLICIES
@@ -13,7 +14,6 @@ from kfvo_ros.keyframes.base import DecisionInput
 from kfvo_ros.keyframes.heuristics import MIN_TRACKS, Every, OpticalFlow, Survival
 from kfvo_ros.keyframes.learned import Learned
 from kfvo_ros.keyframes.observation import observe
-from kfvo_ros.tracking import Tracks
 
 COUNT = 100
 
@@ -21,12 +21,12 @@ COUNT = 100
 def decision(flow: float = 0.0, survivors: int = COUNT, start: int = COUNT) -> DecisionInput:
     """Return a decision where `survivors` of the keyframe's tracks moved by `flow` [px]."""
     rng = np.random.default_rng(0)
-    keyframe = Tracks(np.arange(start), rng.uniform(0.0, 500.0, (start, 2)))
+    keyframe = sure(np.arange(start), rng.uniform(0.0, 500.0, (start, 2)))
     angles = rng.uniform(0.0, 2.0 * np.pi, survivors)
     shift = flow * np.column_stack([np.cos(angles), np.sin(angles)])
     new = rng.uniform(0.0, 500.0, (50, 2))
-    newest = Tracks(np.concatenate([np.arange(survivors), 1000 + np.arange(50)]),
-                    np.concatenate([keyframe.pixels[:survivors] + shift, new]))
+    newest = sure(np.concatenate([np.arange(survivors), 1000 + np.arange(50)]),
+                  np.concatenate([keyframe.pixels[:survivors] + shift, new]))
     return DecisionInput(np.zeros(1, dtype=np.float32), keyframe, newest, 1)
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from odometry_scenes import sure
 from policies import ALWAYS, NEVER, random_actor, write_policy
 from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
@@ -34,8 +35,8 @@ SETTING = Setting('geometric', 'depth', 8, LAYOUT)
 def decision(observation: np.ndarray, survivors: int = 80, flow: float = 10.0,
              gap: int = 1) -> DecisionInput:
     pixels = np.random.default_rng(3).uniform(50.0, 400.0, (100, 2))
-    return DecisionInput(observation, Tracks(np.arange(100), pixels),
-                         Tracks(np.arange(survivors), pixels[:survivors] + [flow, 0.0]), gap)
+    return DecisionInput(observation, sure(np.arange(100), pixels),
+                         sure(np.arange(survivors), pixels[:survivors] + [flow, 0.0]), gap)
 
 
 def test_the_network_is_the_one_that_torch_runs():

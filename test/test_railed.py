@@ -6,12 +6,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from odometry_scenes import sure
 
 from kfvo_ros.keyframes.base import DecisionInput
 from kfvo_ros.keyframes.rail import NO_RAIL, Rail
 from kfvo_ros.learning.railed import RailAlone, Random, Taught
 from kfvo_ros.learning.teacher import Teacher
-from kfvo_ros.tracking import Tracks
 
 COUNT = 100
 RAIL = Rail(min_survival=0.5, max_gap=40, min_flow=2.0)
@@ -23,8 +23,8 @@ def decision(flow: float, survivors: int = COUNT, gap: int = 1) -> DecisionInput
     """Return a decision where `survivors` of the keyframe's tracks moved by `flow` [px]."""
     pixels = np.random.default_rng(0).uniform(0.0, 500.0, (COUNT, 2))
     observation = np.array([np.log1p(flow), survivors / COUNT, 0.0], dtype=np.float32)
-    return DecisionInput(observation, Tracks(np.arange(COUNT), pixels),
-                         Tracks(np.arange(survivors), pixels[:survivors] + [flow, 0.0]), gap)
+    return DecisionInput(observation, sure(np.arange(COUNT), pixels),
+                         sure(np.arange(survivors), pixels[:survivors] + [flow, 0.0]), gap)
 
 
 @pytest.mark.parametrize('policy', [RailAlone(RAIL), Random(RAIL, 0),

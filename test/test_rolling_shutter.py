@@ -8,11 +8,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from odometry_scenes import sure
 
 from kfvo_ros import geometry
 from kfvo_ros.backbones.geometric.rolling_shutter import MAX_GAP_NS, RollingShutter
 from kfvo_ros.camera import Camera
-from kfvo_ros.tracking import Tracks
 
 READOUT = 0.03
 CAMERA = Camera(640, 480, 517.0, 517.0, 319.5, 239.5, readout_s=READOUT)
@@ -59,7 +59,7 @@ def test_turning_camera_is_corrected_to_a_pixel(seed, noise):
         rolling, still = camera.expose(index * FRAME_NS * 1e-9)
         ids = np.flatnonzero(inside(rolling))[::3]
         rolling = rolling + noise * rng.normal(size=rolling.shape)
-        corrected = shutter.correct(1 + index * FRAME_NS, Tracks(ids, rolling[ids]))
+        corrected = shutter.correct(1 + index * FRAME_NS, sure(ids, rolling[ids]))
         if index >= 2:
             before.append(np.linalg.norm(rolling[ids] - still[ids], axis=1))
             after.append(np.linalg.norm(corrected - still[ids], axis=1))
@@ -77,7 +77,7 @@ def test_new_tracks_are_corrected_by_their_surroundings():
         rolling, still = camera.expose(index * FRAME_NS * 1e-9)
         ids = np.flatnonzero(inside(rolling))
         ids = ids[(ids % 12 < index + 1) & (ids % 4 == 0)]
-        corrected = shutter.correct(1 + index * FRAME_NS, Tracks(ids, rolling[ids]))
+        corrected = shutter.correct(1 + index * FRAME_NS, sure(ids, rolling[ids]))
         new = ~np.isin(ids, list(seen))
         seen.update(ids.tolist())
         if index >= 3 and new.any():
@@ -91,7 +91,7 @@ def test_global_shutter_is_left_alone():
     camera, shutter = TurningCamera(0), RollingShutter(replace(CAMERA, readout_s=0.0))
     for index in range(4):
         rolling, _ = camera.expose(index * FRAME_NS * 1e-9)
-        tracks = Tracks(np.arange(len(rolling)), rolling)
+        tracks = sure(np.arange(len(rolling)), rolling)
         assert shutter.correct(1 + index * FRAME_NS, tracks) is tracks.pixels
 
 
@@ -101,9 +101,9 @@ def test_nothing_is_corrected_without_a_motion_to_tell_from():
     ids = np.flatnonzero(inside(first) & inside(second))
     for stamp_ns, kept in [(1 + FRAME_NS, ids[:10]), (2 + MAX_GAP_NS, ids), (1, ids)]:
         shutter = RollingShutter(CAMERA)
-        start = Tracks(ids, first[ids])
+        start = sure(ids, first[ids])
         assert np.array_equal(shutter.correct(1, start), start.pixels)
-        later = Tracks(kept, second[kept])
+        later = sure(kept, second[kept])
         assert np.array_equal(shutter.correct(stamp_ns, later), later.pixels)
 
 
@@ -112,5 +112,5 @@ def test_a_still_camera_is_not_moved():
     _, still = camera.expose(0.0)
     ids = np.flatnonzero(inside(still))
     for index in range(3):
-        corrected = shutter.correct(1 + index * FRAME_NS, Tracks(ids, still[ids]))
+        corrected = shutter.correct(1 + index * FRAME_NS, sure(ids, still[ids]))
         np.testing.assert_allclose(corrected, still[ids], atol=1e-9)

@@ -50,7 +50,7 @@ def test_a_turn_that_begins_or_reverses_is_followed(scene, field):
     last, image = cut(scene, 140, 90), cut(scene, 50, 90)
     points = corners(last)
     stay = points[:, 0] + 90.0 < WIDTH - 20.0
-    after, found = TrackSearch(field).find_again(last, image, points)
+    after, found, _ = TrackSearch(field).find_again(last, image, points)
     assert found[stay].mean() > 0.9
     assert np.abs(after - points - (90.0, 0.0))[found & stay].max() < 0.5
 
@@ -73,7 +73,7 @@ def test_what_the_shift_was_off_the_last_time_is_taken_off(scene, monkeypatch, t
     monkeypatch.setattr(optical_flow, 'follow', watched)
     search, points = TrackSearch(moved(0, 0)), corners(image)
     for _ in range(2):
-        after, found = search.find_again(image, image, points)
+        after, found, _ = search.find_again(image, image, points)
         search.learn(points[found], after[found], SIZE)
     assert begun == pytest.approx(starts, abs=0.1)
 
@@ -89,7 +89,7 @@ def test_a_repeated_texture_is_not_mistaken_for_its_twin():
     last, image = wall[:, 100:420].copy(), wall[:, 60:380].copy()
     points = corners(last)
     points = points[(points[:, 0] < 260.0)]
-    after, found = TrackSearch(moved(0, 0)).find_again(last, image, points)
+    after, found, _ = TrackSearch(moved(0, 0)).find_again(last, image, points)
     right = np.abs(after - points - (40.0, 0.0)).max(axis=1) < 0.5
     assert found.mean() > 0.8 and right[found].mean() > 0.95
 
@@ -116,6 +116,6 @@ def test_a_fast_turn_in_a_room_leaves_half_of_the_tracks():
 
 def test_images_without_content_give_no_tracks_and_no_error():
     flat = np.full((HEIGHT, WIDTH), 90, dtype=np.uint8)
-    _, found = TrackSearch().find_again(flat, flat, np.array([[50.0, 60.0]]))
+    _, found, _ = TrackSearch().find_again(flat, flat, np.array([[50.0, 60.0]]))
     assert found.shape == (1,)
     assert np.isfinite(whole_shift(flat, flat, None)).all()

@@ -36,6 +36,7 @@ def write_drive(path: Path, drive: Drive) -> None:
         'counts': np.array([len(each) for each in tracks], dtype=np.int64),
         'ids': np.concatenate([each.ids for each in tracks]),
         'pixels': np.concatenate([each.pixels for each in tracks]),
+        'doubts': np.concatenate([each.doubts for each in tracks]),
         'points': np.concatenate([_points(each.payload, all_of_it)
                                   for each, all_of_it in zip(encoded, tracks, strict=True)])}
     camera = drive.frames[0].camera
@@ -57,7 +58,8 @@ def read_drive(path: Path) -> Drive | None:
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         camera = Camera(**head['camera'] | {'distortion': tuple(head['camera']['distortion'])})
         rows = np.cumsum(arrays['counts'])[:-1]
-        parts = zip(*(np.split(arrays[name], rows) for name in ('ids', 'pixels', 'points')))
+        parts = zip(*(np.split(arrays[name], rows)
+                      for name in ('ids', 'pixels', 'doubts', 'points')))
         encoded = [_encoded(*each) for each in zip(arrays['stamps_ns'], arrays['descriptors'],
                                                    arrays['indices'], parts, strict=True)]
         return Drive(head['name'],
@@ -75,8 +77,8 @@ def _points(view: View, tracks: Tracks) -> np.ndarray:
 
 
 def _encoded(stamp_ns: np.int64, descriptor: np.ndarray, index: np.int64,
-             parts: tuple[np.ndarray, np.ndarray, np.ndarray]) -> Encoded:
-    ids, pixels, points = parts
-    tracks, usable = Tracks(ids, pixels), np.isfinite(points).all(axis=1)
+             parts: tuple[np.ndarray, ...]) -> Encoded:
+    *tracked, points = parts
+    tracks, usable = Tracks(*tracked), np.isfinite(points).all(axis=1)
     return Encoded(int(stamp_ns), descriptor,
                    View(int(index), tracks.select(usable), points[usable]), tracks)

@@ -9,8 +9,9 @@ poses T_anchor_frame = (R, t) and origins (R_h, t_h) the point lies in a frame a
 
     p = R^T (lifted - r t),  lifted = R_h q + r t_h,
 
-its residual is focal (p_xy / p_z - seen_xy) [px] under Cauchy's loss, and derivatives are taken
-for R <- R exp(w), t <- t + R d. The first frames of a window may be fixed; the others are free.
+its residual is certainty focal (p_xy / p_z - seen_xy) [px] under Cauchy's loss, and derivatives
+are taken for R <- R exp(w), t <- t + R d. The first frames of a window may be fixed; the others
+are free.
 
 Arrays end in the P points, so that the processor takes several at a time.
 """
@@ -68,13 +69,14 @@ def _project(problem: Problem, state: State, lifted: np.ndarray, j: int, view: n
         u = (R[0, 0] * a + R[1, 0] * b + R[2, 0] * c) * near
         v = (R[0, 1] * a + R[1, 1] * b + R[2, 1] * c) * near
         view[0, k], view[1, k], view[2, k] = u, v, near
-        view[3, k] = problem.focal * (u - problem.seen[j, 0, k])
-        view[4, k] = problem.focal * (v - problem.seen[j, 1, k])
+        focal = problem.certainty[k] * problem.focal
+        view[3, k] = focal * (u - problem.seen[j, 0, k])
+        view[4, k] = focal * (v - problem.seen[j, 1, k])
 
 
 @compiled
 def reprojection_errors(problem: Problem, state: State) -> np.ndarray:
-    """Return errors (F, P) [px]: 0 where unseen, BEHIND_ERROR behind a camera."""
+    """Return what errors (F, P) count for [px]: 0 where unseen, BEHIND_ERROR behind a camera."""
     frames, points = problem.mask.shape
     lifted, _ = _lift(problem, state.points)
     view, errors = np.empty((5, points)), np.zeros((frames, points))
@@ -104,7 +106,7 @@ def cost(problem: Problem, state: State) -> float:
 
 @compiled
 def _weigh(problem: Problem, j: int, view: np.ndarray) -> None:
-    """Fill view[5], the focal length times the root of the weight in the loss.
+    """Fill view[5], the focal length times certainty and the root of the weight in the loss.
 
     The residuals are multiplied by that root; it is 0 for what is unseen or behind.
     """
@@ -113,7 +115,8 @@ def _weigh(problem: Problem, j: int, view: np.ndarray) -> None:
         e0, e1 = view[3, k], view[4, k]
         root = math.sqrt(reach / (reach + e0 * e0 + e1 * e1))
         root = root if mask[k] and view[2, k] < 1.0 / MIN_DEPTH else 0.0
-        view[3, k], view[4, k], view[5, k] = root * e0, root * e1, root * problem.focal
+        view[3, k], view[4, k] = root * e0, root * e1
+        view[5, k] = root * problem.certainty[k] * problem.focal
 
 
 @compiled

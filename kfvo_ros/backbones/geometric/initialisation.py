@@ -176,7 +176,7 @@ class Initialiser:
         rays = np.ones((len(rows), 3))
         rays[:, :2] = observations.seen[rows, hosts]
         part = Observations(observations.ids[rows], observations.seen[rows], mask[rows], hosts,
-                            rays)
+                            rays, observations.certainty[rows])
         inverse_depths, _ = _triangulate(part, T_w_frame)
         return self._resect(part, T_w_frame, inverse_depths,
                             inverse_depths > LEAST_INVERSE_DEPTH, frame, fallback)

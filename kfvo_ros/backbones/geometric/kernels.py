@@ -20,11 +20,12 @@ END = np.iinfo(np.int64).max
 
 
 @compiled
-def merge(ids, points, ends, first_moving):
-    """Return the tracks (ids, seen, mask) that two views see, one of them moving.
+def merge(ids, points, doubts, ends, first_moving):
+    """Return the tracks (ids, seen, mask, doubts) that two views see, one of them moving.
 
-    `ids` (N,) and `points` (N, 2) are those of all views, one after the other; each view's ids
-    increase, and end before `ends` (F,). Views from `first_moving` on move.
+    `ids` (N,), `points` (N, 2) and `doubts` (N,) are those of all views, one after the other; each
+    view's ids increase, and end before `ends` (F,). Views from `first_moving` on move. Of doubts
+    the last one counts.
     """
     frames, count = len(ends), 0
     heads = np.zeros(frames, dtype=np.int64)
@@ -33,6 +34,7 @@ def merge(ids, points, ends, first_moving):
     merged = np.empty(len(ids) // 2, dtype=np.int64)
     seen = np.empty((len(merged), frames, 2))
     mask = np.empty((len(merged), frames), dtype=np.bool_)
+    doubted = np.empty(len(merged))
     while True:
         lowest, views, last = END, 0, -1
         for frame in range(frames):
@@ -41,8 +43,10 @@ def merge(ids, points, ends, first_moving):
                 views, last = (views + 1 if ids[head] == lowest else 1), frame
                 lowest = ids[head]
         if views == 0:
-            return merged[:count], seen[:count], mask[:count]
+            return merged[:count], seen[:count], mask[:count], doubted[:count]
         wanted = views >= 2 and last >= first_moving
+        if wanted:
+            merged[count], doubted[count] = lowest, doubts[heads[last]]
         for frame in range(frames):
             head = heads[frame]
             sees = head < ends[frame] and ids[head] == lowest
@@ -51,9 +55,7 @@ def merge(ids, points, ends, first_moving):
                 mask[count, frame] = sees
                 seen[count, frame, 0] = points[head, 0] if sees else 0.0
                 seen[count, frame, 1] = points[head, 1] if sees else 0.0
-        if wanted:
-            merged[count] = lowest
-            count += 1
+        count += wanted
 
 
 @compiled
@@ -242,7 +244,8 @@ def medians_of_nearest(places, known_places, known_values, neighbours):
 def load() -> None:
     """Compile everything, or load it from the cache, before a frame would wait for it."""
     rotations, translations, ones = np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3)), np.ones(1)
-    ids, seen, mask = merge(np.zeros(2, dtype=np.int64), np.zeros((2, 2)), np.array([1, 2]), 1)
+    ids, seen, mask, _ = merge(np.zeros(2, dtype=np.int64), np.zeros((2, 2)), np.zeros(2),
+                               np.array([1, 2]), 1)
     hosts, rays = np.zeros(1, dtype=np.int64), np.ones((1, 3))
     triangulate(rotations, translations, hosts, rays, seen, mask)
     place(rotations, translations, hosts, rays, ones)
@@ -252,7 +255,7 @@ def load() -> None:
     median_where(np.ones((1, 1)), mask[:, :1])
     count_shared(ids, ids)
     problem = ba.Problem(hosts, np.tile(np.eye(4), (2, 1, 1)), np.zeros((2, 2, 1)),
-                         np.ones((2, 1), dtype=np.bool_), 1.0, 1, ones, ones, 1.0)
+                         np.ones((2, 1), dtype=np.bool_), 1.0, 1, ones, ones, ones, 1.0)
     state = ba.adjust(problem, ba.State(rotations, translations, np.ones((3, 1))), 1)
     ba.reprojection_errors(problem, state)
     ba.cost(problem, state)

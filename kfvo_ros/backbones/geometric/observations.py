@@ -13,6 +13,10 @@ from kfvo_ros.backbones.geometric import kernels
 from kfvo_ros.backbones.geometric.lens import Lens
 from kfvo_ros.tracking import Tracks
 
+HALF_BELIEVED = 0.1
+"""A track whose patches part by so much in each frame weighs half as much as one that is sure
+[px]."""
+
 
 @dataclass(frozen=True)
 class View:
@@ -32,7 +36,8 @@ class Observations:
     """The tracks that at least two of F frames see.
 
     ``ids`` (P,) increasing; ``seen`` (P, F, 2) normalised coordinates under ``mask`` (P, F);
-    ``hosts`` (P,) the first frame that sees a point and ``rays`` (P, 3) its ray there.
+    ``hosts`` (P,) the first frame that sees a point and ``rays`` (P, 3) its ray there; its tracks
+    are to be believed ``certainty`` (P,) times as much as the best.
     """
 
     ids: np.ndarray
@@ -40,6 +45,7 @@ class Observations:
     mask: np.ndarray
     hosts: np.ndarray
     rays: np.ndarray
+    certainty: np.ndarray
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -47,11 +53,13 @@ class Observations:
 
 def tabulate(views: Sequence[View], anchor: int, lens: Lens) -> Observations:
     """Gather the tracks of `views`, oldest first, that a frame after the anchor sees."""
-    ids, seen, mask = kernels.merge(
+    ids, seen, mask, doubts = kernels.merge(
         np.concatenate([view.tracks.ids for view in views]),
         lens.straighten(np.concatenate([view.points for view in views])),
+        np.concatenate([view.tracks.doubts for view in views]),
         np.cumsum([len(view.points) for view in views]), anchor + 1)
     hosts = mask.argmax(axis=1) if len(ids) else np.zeros(0, dtype=np.int64)
     rays = np.ones((len(ids), 3))
     rays[:, :2] = seen[np.arange(len(ids)), hosts]
-    return Observations(ids, seen, mask, hosts, rays)
+    return Observations(ids, seen, mask, hosts, rays,
+                        1.0 / np.sqrt(1.0 + np.square(doubts / HALF_BELIEVED)))

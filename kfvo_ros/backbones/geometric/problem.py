@@ -14,9 +14,9 @@ class Problem(NamedTuple):
 
     ``hosts`` (P,) are the frames that see a point first, ``origins`` (F, 4, 4) where they were
     guessed to be; ``seen`` (F, 2, P) under ``mask`` (F, P), normalised and undistorted; ``focal``
-    [px]. The first ``fixed`` frames are not moved. A point's inverse depth is drawn to
-    ``prior_values`` (P,) with ``prior_weights`` (P,) [px^2 per unit squared]. Errors well beyond
-    ``width`` [px] are let go.
+    [px]. The first ``fixed`` frames are not moved. A point's errors count ``certainty`` (P,)
+    times; its inverse depth is drawn to ``prior_values`` (P,) with ``prior_weights`` (P,) [px^2
+    per unit squared]. Errors that count for well more than ``width`` [px] are let go.
     """
 
     hosts: np.ndarray
@@ -25,6 +25,7 @@ class Problem(NamedTuple):
     mask: np.ndarray
     focal: float
     fixed: int
+    certainty: np.ndarray
     prior_weights: np.ndarray
     prior_values: np.ndarray
     width: float
@@ -34,6 +35,7 @@ class Problem(NamedTuple):
         return self._replace(hosts=self.hosts[chosen],
                              seen=np.ascontiguousarray(self.seen[:, :, chosen]),
                              mask=np.ascontiguousarray(self.mask[:, chosen]),
+                             certainty=self.certainty[chosen],
                              prior_weights=self.prior_weights[chosen],
                              prior_values=self.prior_values[chosen])
 

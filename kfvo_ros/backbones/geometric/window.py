@@ -173,7 +173,8 @@ def _draft(observations: Observations, focal: float, guess: Guess, anchor: int) 
     state = ba.adjust(problem, guess.state, ITERATIONS)
     errors = ba.reprojection_errors(problem, state)
     noise = _noise(problem, errors)
-    fits = errors.max(axis=0) <= np.clip(MAX_NOISE * noise, *MAX_ERROR)
+    largest = errors.max(axis=0) / problem.certainty
+    fits = largest <= np.clip(MAX_NOISE * noise, *MAX_ERROR)
     return _Draft(problem, state, problem.mask & fits, noise, ba.cost(problem, state))
 
 
@@ -203,7 +204,8 @@ def _problem(observations: Observations, focal: float, guess: Guess, fixed: int)
     return ba.Problem(observations.hosts, origins,
                       np.ascontiguousarray(observations.seen.transpose(1, 2, 0)),
                       np.ascontiguousarray(observations.mask.T),
-                      focal, fixed, strength / spread ** 2, expected, WIDE)
+                      focal, fixed, observations.certainty, strength / spread ** 2, expected,
+                      WIDE)
 
 
 def _inverse(system: np.ndarray) -> np.ndarray:
