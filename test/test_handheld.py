@@ -1,12 +1,13 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Turning on the spot, as people and robots do: little parallax, and much noise."""
+"""Turning on the spot and hovering, as people and robots do: little parallax, and much noise."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
 import numpy as np
+import pytest
 from odometry_scenes import RATE_NS, sure
 
 from kfvo_ros import geometry, metrics
@@ -41,9 +42,9 @@ def points_around(rng: np.random.Generator) -> np.ndarray:
                      / np.linalg.norm(points, axis=1, keepdims=True))
 
 
-def tracks_of(rng: np.random.Generator, points: np.ndarray,
-              T_world_camera: np.ndarray) -> Iterator[Tracks]:
-    """Yield what is seen of the points, `NOISE` [px] off in each axis."""
+def tracks_of(rng: np.random.Generator, points: np.ndarray, T_world_camera: np.ndarray,
+              noise: float = NOISE) -> Iterator[Tracks]:
+    """Yield what is seen of the points, `noise` [px] off in each axis."""
     ids, count = np.full(POINTS, -1), 0
     for T_camera_world in geometry.invert(T_world_camera):
         x, y, z = (points @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]).T
@@ -56,7 +57,7 @@ def tracks_of(rng: np.random.Generator, points: np.ndarray,
         count += len(born)
         rows = np.flatnonzero(ids >= 0)
         rows = rows[np.argsort(ids[rows])]
-        yield sure(ids[rows], pixels[rows] + NOISE * rng.normal(size=(len(rows), 2)))
+        yield sure(ids[rows], pixels[rows] + noise * rng.normal(size=(len(rows), 2)))
 
 
 def replay(tracks_in_turn: Iterable[Tracks]) -> Trajectory:
@@ -121,3 +122,36 @@ def test_what_a_turn_brings_into_view_does_not_outvote_the_motion_after_it():
                        for part in (slice(0, 40), slice(-40, None)))
         drifts.append(np.log(last / first))
     assert np.abs(drifts).mean() < 0.04, drifts
+
+
+def hover_before_a_wall(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Return points (POINTS, 3) of a wall, and poses (120, 4, 4) along it.
+
+    The camera turns by 0.6 degrees per frame while it stands, between two metres of sliding.
+    """
+    pace = np.concatenate([np.full(40, 0.03), np.zeros(40), np.full(40, 0.03)])
+    pace = np.convolve(np.pad(pace, 5, 'edge'), np.ones(11) / 11, 'valid')
+    turn = np.concatenate([np.zeros(40), np.full(40, np.radians(0.6)), np.zeros(40)])
+    return (rng.uniform((-6.0, -3.0, 2.0), (6.0, 3.0, 2.5), (POINTS, 3)),
+            geometry.make_transform(geometry.exp_so3(np.cumsum(turn)[:, None] * [0.0, 1.0, 0.0]),
+                                    np.cumsum(pace)[:, None] * [1.0, 0.0, 0.0]))
+
+
+def sliding(rng: np.random.Generator, tracks_in_turn: Iterable[Tracks]) -> Iterator[Tracks]:
+    """Yield tracks that wander from their points, by 0.05 px in each axis from frame to frame."""
+    off = np.zeros((0, 2))
+    for tracks in tracks_in_turn:
+        off = np.concatenate([off, np.zeros((tracks.ids.max() + 1 - len(off), 2))])
+        off += 0.05 * rng.normal(size=off.shape)
+        yield sure(tracks.ids, tracks.pixels + off[tracks.ids])
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_hovering_before_a_wall_keeps_the_scale(seed):
+    """Two motions explain the first frames after it, and the window has no depths to tell."""
+    rng = np.random.default_rng(seed)
+    points, truth = hover_before_a_wall(rng)
+    found = replay(sliding(rng, tracks_of(rng, points, truth, noise=0.15)))
+    first, last = (spread(truth[part, :3, 3]) / spread(found.poses[part, :3, 3])
+                   for part in (slice(0, 35), slice(-30, None)))
+    assert abs(np.log(last / first)) < 0.05

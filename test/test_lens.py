@@ -205,7 +205,7 @@ def test_a_right_calibration_is_left_alone():
 
 def test_a_start_from_nothing_keeps_the_lens_and_nothing_else():
     lens = Lens(np.array([0.001, 0.002, 0.0, 0.0, 0.0]), asked=7)
-    memory = Memory((), np.eye(4)[None], True, 20, lens)
+    memory = Memory(measured=True, windows=20, lens=lens)
     previous = Previous(np.eye(4)[None], np.eye(4), None, memory)
     kept = memory_of(previous)
     assert kept.lens is lens

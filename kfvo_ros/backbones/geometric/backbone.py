@@ -107,8 +107,11 @@ def _estimate(window: Window, stream: GeometricStream) -> Estimate:
     return Estimate(poses[solution.anchor:], solution.covariance, solution.points,
                     signals(solution, motion),
                     Status.HELD if motion.window_parallax < HELD_PARALLAX else Status.OK,
-                    Memory(history.views + views, poses, memory.measured or solution.measured,
-                           memory.windows + 1, lens, _trusted(memory, solution)),
+                    Memory(history.views + views, poses, solution.median_depth,
+                           measured=memory.measured or solution.measured,
+                           unmeasured=memory.unmeasured if solution.measured else views[-1].index,
+                           windows=memory.windows + 1, lens=lens,
+                           trusted=_trusted(memory, solution)),
                     lens.intrinsics(stream.camera) if lens.known else None)
 
 

@@ -96,11 +96,9 @@ class Initialiser:
         It is resected from known points, or found by epipolar geometry from all its tracks since
         the last keyframe, which needs known points for the length of the step alone.
         """
-        T_anchor_frame = np.concatenate([history.T_anchor_view, previous.T_anchor_frame,
-                                         previous.T_anchor_latest[None]])
+        T_anchor_frame = _poses_before(previous, history)
         known = known_inverse_depths(observations, T_anchor_frame, previous)
-        is_known = np.isfinite(known)
-        visible = is_known & observations.mask[:, -1]
+        visible = np.isfinite(known) & observations.mask[:, -1]
         if by_epipolar_geometry:
             T_anchor_frame[-1] = self._step(observations, T_anchor_frame, known, visible)
         else:
@@ -108,8 +106,23 @@ class Initialiser:
                 observations, T_anchor_frame, known, visible, len(T_anchor_frame) - 1,
                 previous.T_anchor_latest)
         state = self._complete(observations, T_anchor_frame, known)
-        trusted = is_known & np.isin(observations.ids, memory_of(previous).trusted)
-        return Guess(state, _expect(observations, known, state.points[2]), trusted)
+        return _guess(observations, previous, state, known)
+
+    def from_history(self, observations: Observations, previous: Previous,
+                     history: History) -> Guess:
+        """Return poses resected from what history and anchor see, which are final, and no other.
+
+        What the last window took for motion of its frames, and for depths, is not built on:
+        where the camera hovered and moves on, the two may be wrong together.
+        """
+        T_anchor_frame = _poses_before(previous, history)
+        known = known_inverse_depths(observations, T_anchor_frame, previous)
+        final = np.arange(len(T_anchor_frame)) <= len(history.views)
+        for frame in range(len(history.views) + 1, len(T_anchor_frame)):
+            T_anchor_frame[frame] = self._resect_in_turn(observations, T_anchor_frame, final,
+                                                         frame, T_anchor_frame[frame])
+        state = self._complete(observations, T_anchor_frame, np.full(len(observations), np.nan))
+        return _guess(observations, previous, state, known)
 
     def _best_pair(self, observations: Observations) -> tuple[int, int] | None:
         """Return the two frames whose relative pose is best determined."""
@@ -211,6 +224,19 @@ class Initialiser:
         filled = np.where(unknown, np.where(believed, triangulated, median), inverse_depths)
         return State(*_rotations_and_translations(T_anchor_frame),
                      np.stack([*observations.rays[:, :2].T, filled]))
+
+
+def _poses_before(previous: Previous, history: History) -> np.ndarray:
+    """Return where earlier windows had history and frames, the new one where the camera was."""
+    return np.concatenate([history.T_anchor_view, previous.T_anchor_frame,
+                           previous.T_anchor_latest[None]])
+
+
+def _guess(observations: Observations, previous: Previous, state: State,
+           known: np.ndarray) -> Guess:
+    """Return the start, with what earlier windows let expect: inverse depths (P,) or NaN."""
+    trusted = np.isfinite(known) & np.isin(observations.ids, memory_of(previous).trusted)
+    return Guess(state, _expect(observations, known, state.points[2]), trusted)
 
 
 def known_inverse_depths(observations: Observations, T_anchor_frame: np.ndarray,

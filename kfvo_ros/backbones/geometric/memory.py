@@ -20,8 +20,9 @@ HISTORY = 8
 A window of eight frames forgets what it knew of depth; these long baselines are what keeps the
 scale. They are final and cost no unknowns.
 """
-MAX_SHARED = 0.8
-"""A keyframe joins the history when it shares fewer tracks with the one before it there."""
+MAX_SHARED, LEAST_BASELINE = 0.8, 0.003
+"""A keyframe joins the history when it shares fewer tracks with the one before it there, and is
+so far from it in depths of the scene: hovering should not drive out what knows the scale."""
 MIN_WINDOWS = 6
 """Before a plane, two motions explain two frames; so many windows from the start on tell which."""
 
@@ -30,14 +31,17 @@ MIN_WINDOWS = 6
 class Memory:
     """The views of a window and its history at ``T_anchor_view``.
 
-    ``measured`` says that depths were measured well at some time, ``windows`` how many there were
-    in a row since the start; ``lens`` is what is known of the lens by then; ``trusted`` are the
-    ids of the points whose own depths were measured well.
+    ``depth`` is the median of the points'. ``measured`` says that depths were measured well at
+    some time, ``unmeasured`` is the index of the last view that was placed while they were not;
+    ``windows`` is how many there were in a row since the start; ``lens`` is what is known of the
+    lens by then; ``trusted`` are the ids of the points whose own depths were measured well.
     """
 
     views: tuple[View, ...] = ()
     T_anchor_view: np.ndarray = field(default_factory=lambda: np.zeros((0, 4, 4)))
+    depth: float = 1.0
     measured: bool = False
+    unmeasured: int = -1
     windows: int = 0
     lens: Lens = field(default_factory=Lens)
     trusted: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
@@ -50,10 +54,14 @@ class Memory:
 
 @dataclass(frozen=True)
 class History:
-    """Views older than the anchor, and where they are in it, in trajectory units."""
+    """Views older than the anchor, and where they are in it, in trajectory units.
+
+    The window is ``doubted`` when it holds a view that was placed while no depths were measured.
+    """
 
     views: tuple[View, ...] = ()
     T_anchor_view: np.ndarray = field(default_factory=lambda: np.zeros((0, 4, 4)))
+    doubted: bool = False
 
 
 def memory_of(previous: Previous | None) -> Memory:
@@ -77,16 +85,19 @@ def recall(memory: Memory, scale: float, anchor: View) -> History:
     position = indices.index(anchor.index)
     spaced: list[int] = []
     for older in range(position):
-        if not spaced or _differ(memory.views[spaced[-1]], memory.views[older]):
+        if not spaced or _differ(memory, spaced[-1], older):
             spaced.append(older)
     spaced = spaced[-HISTORY:]
     T_anchor_view = geometry.relative(memory.T_anchor_view[position],
                                       memory.T_anchor_view[spaced])
     T_anchor_view[:, :3, 3] *= scale
-    return History(tuple(memory.views[index] for index in spaced), T_anchor_view)
+    return History(tuple(memory.views[index] for index in spaced), T_anchor_view,
+                   bool(spaced) and anchor.index <= memory.unmeasured)
 
 
-def _differ(older: View, newer: View) -> bool:
-    """Return whether enough of the older view's tracks ended before the newer one."""
-    shared = kernels.count_shared(older.tracks.ids, newer.tracks.ids)
-    return bool(shared < MAX_SHARED * len(older.tracks))
+def _differ(memory: Memory, older: int, newer: int) -> bool:
+    """Return whether the camera had moved on, and enough of the older view's tracks had ended."""
+    before, after = memory.views[older].tracks.ids, memory.views[newer].tracks.ids
+    T_older_newer = geometry.relative(memory.T_anchor_view[older], memory.T_anchor_view[newer])
+    return bool(np.linalg.norm(T_older_newer[:3, 3]) > LEAST_BASELINE * memory.depth
+                and kernels.count_shared(before, after) < MAX_SHARED * len(before))

@@ -51,12 +51,10 @@ def signals(solution: Solution, motion: Motion) -> np.ndarray:
     """Return (len(SIGNAL_NAMES),) float32; pixels and information as log(1 + x), angles [rad]."""
     poses = solution.T_anchor_frame
     T_keyframe_newest = geometry.relative(poses[-2], poses[-1])
-    points = solution.points
-    depth = kernels.median(points.depths) if len(points.ids) else 1.0
     newest = solution.observations.mask[:, -1]
     return np.array([
         motion.survival, np.log1p(motion.flow), np.log1p(motion.parallax), motion.gap,
-        np.linalg.norm(T_keyframe_newest[:3, 3]) / max(depth, 1e-9),
+        np.linalg.norm(T_keyframe_newest[:3, 3]) / max(solution.median_depth, 1e-9),
         geometry.rotation_angle(T_keyframe_newest[:3, :3]),
         solution.problem.mask[-1, newest].mean() if newest.any() else 0.0,
         np.log1p(solution.median_information)], dtype=np.float32)

@@ -97,6 +97,11 @@ class Solution:
         return kernels.median(self.points.information) if len(self.points.ids) else 0.0
 
     @cached_property
+    def median_depth(self) -> float:
+        """Median distance of the points from the anchor, 1 without points."""
+        return kernels.median(self.points.depths) if len(self.points.ids) else 1.0
+
+    @cached_property
     def noise(self) -> float:
         """How far the tracks that are left are off [px]."""
         return _noise(self.problem, ba.reprojection_errors(self.problem, self.state))
@@ -134,8 +139,8 @@ def solve(observations: Observations, initialiser: Initialiser, previous: Previo
           history: History) -> Solution:
     """Place the frames of a window in the anchor, in the unit of `previous`, else median depth 1.
 
-    While little is known, a start from nothing competes with the one from the last window,
-    which may sit in a wrong minimum.
+    The one from the last window may sit in a wrong minimum. While little is known, a start from
+    nothing competes with it; where the window is doubted, one from its history.
     """
     anchor, focal = len(history.views), initialiser.focal
     drafts = []
@@ -144,6 +149,9 @@ def solve(observations: Observations, initialiser: Initialiser, previous: Previo
         drafts.append(_draft(observations, focal, guess, anchor))
         if drafts[0].newest_inlier_share < SUSPICIOUS_SHARE:
             guess = initialiser.from_previous(observations, previous, history, True)
+            drafts.append(_draft(observations, focal, guess, anchor))
+        if history.doubted:
+            guess = initialiser.from_history(observations, previous, history)
             drafts.append(_draft(observations, focal, guess, anchor))
     if not drafts or (not memory_of(previous).certain and initialiser.moved(observations)):
         guess = initialiser.from_nothing(observations)
