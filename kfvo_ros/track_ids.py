@@ -14,3 +14,10 @@ def shared(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     places = b.searchsorted(a)
     in_a = np.flatnonzero(b.take(places, mode='clip') == a)
     return in_a, places[in_a]
+
+
+def present(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the mask (N,) of the ids in `a` that are in `b` too, both increasing."""
+    mask = np.zeros(len(a), dtype=bool)
+    mask[shared(a, b)[0]] = True
+    return mask

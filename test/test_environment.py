@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import repeat
+from itertools import islice, repeat
 
 import numpy as np
 import pytest
@@ -18,6 +18,7 @@ from kfvo_ros.backbones.base import Status
 from kfvo_ros.backbones.geometric.backbone import GeometricBackbone
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.keyframes.base import KeyframePolicy
+from kfvo_ros.keyframes.heuristics import Every
 from kfvo_ros.keyframes.rail import Rail
 from kfvo_ros.learning.drives import Drive, record
 from kfvo_ros.learning.environment import OBSERVATION, PRIVILEGED, KeyframeEnvironment
@@ -137,6 +138,12 @@ def test_the_critic_is_told_true_motions_in_the_trajectory_s_unit(backbone, driv
     scales = [np.linalg.norm(true[:3, 3]) / np.linalg.norm(motion[:3, 3])
               for true, motion in zip(true_motions, motions)]
     assert np.ptp(scales) < 1e-4 * scales[0]  # metres per unit of the trajectory
+    odometry = KeyframeOdometry(backbone, Every())
+    for frame in islice(SyntheticSequence(3, 'smooth', FRAMES), 8):
+        odometry.process(frame)
+    estimated = np.array([frame.T_world_camera[:3, 3] for frame in odometry.window[:7]])
+    expected = geometry.umeyama(estimated, truth[1:8, :3, 3]).scale
+    assert scales[0] == pytest.approx(expected, rel=0.01)
     for true, motion in zip(true_motions, motions):
         np.testing.assert_allclose(motion[:3, :3], true[:3, :3], atol=1e-6)
     assert told[21] == told[22] == 0.0

@@ -18,14 +18,15 @@ def test_no_frame_waits_for_the_compiler():
     script = textwrap.dedent('''
         import sys
         from numba.core.dispatcher import Dispatcher
-        from kfvo_ros.backbones.geometric import bundle_adjustment, kernels, schur
+        from kfvo_ros.backbones.geometric import bundle_adjustment, kernels, reprojection, schur
         from kfvo_ros.backbones.geometric.backbone import GeometricBackbone
         from kfvo_ros.keyframes.heuristics import Every
         from kfvo_ros.odometry import KeyframeOdometry
         from kfvo_ros.sequences.synthetic import SyntheticSequence
 
         def signatures():
-            return {name: len(kernel.signatures) for module in (bundle_adjustment, kernels, schur)
+            modules = (bundle_adjustment, kernels, reprojection, schur)
+            return {name: len(kernel.signatures) for module in modules
                     for name, kernel in vars(module).items()
                     if isinstance(kernel, Dispatcher) and not name.startswith('_')}
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kfvo_ros.track_ids import shared
+from kfvo_ros.track_ids import present, shared
 
 
 @pytest.mark.parametrize('seed', range(5))
@@ -17,9 +17,11 @@ def test_shared_ids_are_found_in_both(seed):
     in_a, in_b = shared(a, b)
     assert np.array_equal(a[in_a], b[in_b])
     assert set(a[in_a]) == set(a) & set(b)
+    assert np.array_equal(present(a, b), np.isin(a, b))
 
 
 def test_nothing_is_shared_with_nothing():
     some, none = np.array([3, 5]), np.zeros(0, dtype=np.int64)
     for a, b in ((some, none), (none, some), (none, none), (some, some + 10), (some + 10, some)):
         assert all(len(indices) == 0 for indices in shared(a, b))
+        assert len(present(a, b)) == len(a) and not present(a, b).any()

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import gc
 import hashlib
 import json
 from collections import OrderedDict
@@ -61,6 +62,7 @@ class Archive:
                 if path is not None:
                     write_drive(path, drive)
             self._held[key] = drive
+            gc.freeze()  # Thousands of objects, none in a cycle: not to be searched for garbage.
             if len(self._held) > MOST_HELD:
                 self._held.popitem(last=False)
         self._held.move_to_end(key)

@@ -14,7 +14,7 @@ from kfvo_ros.keyframes.base import DecisionInput
 from kfvo_ros.keyframes.heuristics import Every
 from kfvo_ros.keyframes.rail import Rail
 from kfvo_ros.learning.drives import Drive
-from kfvo_ros.learning.reward import ALIGNED, Reward, align
+from kfvo_ros.learning.reward import STANDSTILL_M, Reward
 from kfvo_ros.odometry import KeyframeOdometry, Placed
 from kfvo_ros.sequences.base import Frame
 
@@ -93,12 +93,12 @@ class Episode:
         is so far: one that is bad already has less to lose.
         """
         estimated, true = self._window()
-        scale = align(estimated[:ALIGNED], true[:ALIGNED], 1.0).scale
+        unit_m = _metres_per_unit(estimated[:, :3, 3], true[:, :3, 3])
         ahead = self._drive.T_truth_camera[self._next - 1:self._next + AHEAD]
         motions = np.concatenate([geometry.relative(true[-1:], true[-2:-1]),
                                   geometry.relative(ahead[:-1], ahead[1:])])
         told = np.zeros((1 + AHEAD, POSE), dtype=np.float32)
-        told[:len(motions), :3] = motions[:, :3, 3] / max(scale, 1e-9)
+        told[:len(motions), :3] = motions[:, :3, 3] / unit_m
         told[:len(motions), 3:] = geometry.quat_xyzw_from_rotation(motions[:, :3, :3])
         return np.append(told, [np.float32(len(motions) < len(told)),
                                 np.float32(self._reward.standing)])
@@ -118,3 +118,12 @@ class Episode:
         return (np.array([placed.keyframe.T_world_camera for placed in self._trail])
                 @ np.array([placed.T_keyframe_camera for placed in self._trail]),
                 self._drive.T_truth_camera[self._next - len(self._trail):self._next])
+
+
+def _metres_per_unit(estimated: np.ndarray, true: np.ndarray) -> float:
+    """Return how much wider true positions (S, 3) are spread than estimated ones, 1 at rest."""
+    estimated_spread, true_spread = (float(np.linalg.norm(positions - positions.mean(axis=0)))
+                                     for positions in (estimated, true))
+    if true_spread < STANDSTILL_M or estimated_spread == 0.0:
+        return 1.0
+    return true_spread / estimated_spread

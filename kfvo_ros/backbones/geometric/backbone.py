@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
+from kfvo_ros import track_ids
 from kfvo_ros.backbones.base import Backbone, Encoded, Estimate, Status, Stream, Window, lost
 from kfvo_ros.backbones.geometric import kernels
 from kfvo_ros.backbones.geometric.initialisation import Initialiser
@@ -118,7 +119,7 @@ def _estimate(window: Window, stream: GeometricStream) -> Estimate:
 def _trusted(memory: Memory, solution: Solution) -> np.ndarray:
     """Return the ids of those points whose depths are measured well, or once were."""
     ids = solution.points.ids
-    return ids[solution.well_known | np.isin(ids, memory.trusted)]
+    return ids[solution.well_known | track_ids.present(ids, memory.trusted)]
 
 
 def _lens(memory: Memory, solution: Solution, views: tuple[View, ...], camera: Camera) -> Lens:

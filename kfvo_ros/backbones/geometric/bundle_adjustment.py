@@ -2,18 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Levenberg-Marquardt over the poses and points of one window, compiled.
 
-A point is (x, y, r) in its *origin*, where its host, the first frame that sees it, was guessed
-to be: inverse depth r along the ray q = (x, y, 1). The ray is sought as the depth is, for what the
-host measured is no better than the rest: taken for exact, its noise would pass for parallax. With
-poses T_anchor_frame = (R, t) and origins (R_h, t_h) the point lies in a frame along
-
-    p = R^T (lifted - r t),  lifted = R_h q + r t_h,
-
-its residual is certainty focal (p_xy / p_z - seen_xy) [px] under Cauchy's loss, and derivatives
-are taken for R <- R exp(w), t <- t + R d. The first frames of a window may be fixed; the others
-are free.
-
-Arrays end in the P points, so that the processor takes several at a time.
+Derivatives are taken for R <- R exp(w), t <- t + R d of the poses, and for the points as they are.
+The first frames of a window may be fixed; the others are free.
 """
 
 from __future__ import annotations
@@ -24,84 +14,24 @@ import numpy as np
 
 from kfvo_ros.backbones.geometric.compilation import compiled
 from kfvo_ros.backbones.geometric.problem import NormalEquations, Problem, State
+from kfvo_ros.backbones.geometric.reprojection import MIN_DEPTH, cost, lift, project, seen_by
 from kfvo_ros.backbones.geometric.schur import add_products, dot, step
 
-MIN_DEPTH = 1e-3
-"""A point nearer than this share of its host depth, or behind, has no residual ..."""
-BEHIND_ERROR = 100.0
-"""... and counts as this many pixels off."""
 FIRST_DAMPING, LEAST_DAMPING = 1e-4, 1e-7
 DAMPING_DOWN, DAMPING_UP = 0.2, 8.0
 MAX_REJECTIONS = 5
 """Steps that may fail in a row before the estimate is taken for a minimum."""
 MIN_IMPROVEMENT = 1e-3
 """A step that lowers the cost by a smaller share is the last one."""
+LONGER = 1.3
+"""Steps go so much farther: Cauchy's loss, which bends less than the parabolas that it is replaced
+by, has its minimum beyond theirs."""
 LEAST_INVERSE_DEPTH = 1e-4
 POSE, LENS, POINT = 6, 5, 3
 """So many numbers each: what a residual depends on, in the order of its derivatives."""
 WIDE_ANGLE = 2.0
 """|x|^2 ends here, 55 degrees off the axis: at the rim of a fisheye a lens that is a little
 wrong would be wrong beyond reason."""
-
-
-@compiled
-def _lift(problem: Problem, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return `lifted` (3, P) of points (3, P), and its derivatives (3, 3, P) by x, y and r."""
-    lifted, slopes = np.empty(points.shape), np.empty((POINT, 3, points.shape[1]))
-    for k in range(points.shape[1]):
-        origin = problem.origins[problem.hosts[k]]
-        for a in range(3):
-            by_x, by_y, by_r = origin[a, 0], origin[a, 1], origin[a, 3]
-            slopes[0, a, k], slopes[1, a, k], slopes[2, a, k] = by_x, by_y, by_r
-            lifted[a, k] = (by_x * points[0, k] + by_y * points[1, k] + origin[a, 2]
-                            + by_r * points[2, k])
-    return lifted, slopes
-
-
-@compiled
-def _project(problem: Problem, state: State, lifted: np.ndarray, j: int, view: np.ndarray) -> None:
-    """Fill what frame j sees of the points, view[:5]: p_xy / p_z, 1 / p_z, residual."""
-    R, t = state.rotations[j], state.translations[j]
-    for k in range(lifted.shape[1]):
-        r = state.points[2, k]
-        a, b, c = lifted[0, k] - r * t[0], lifted[1, k] - r * t[1], lifted[2, k] - r * t[2]
-        near = 1.0 / max(R[0, 2] * a + R[1, 2] * b + R[2, 2] * c, MIN_DEPTH)
-        u = (R[0, 0] * a + R[1, 0] * b + R[2, 0] * c) * near
-        v = (R[0, 1] * a + R[1, 1] * b + R[2, 1] * c) * near
-        view[0, k], view[1, k], view[2, k] = u, v, near
-        focal = problem.certainty[k] * problem.focal
-        view[3, k] = focal * (u - problem.seen[j, 0, k])
-        view[4, k] = focal * (v - problem.seen[j, 1, k])
-
-
-@compiled
-def reprojection_errors(problem: Problem, state: State) -> np.ndarray:
-    """Return what errors (F, P) count for [px]: 0 where unseen, BEHIND_ERROR behind a camera."""
-    frames, points = problem.mask.shape
-    lifted, _ = _lift(problem, state.points)
-    view, errors = np.empty((5, points)), np.zeros((frames, points))
-    for j in range(frames):
-        _project(problem, state, lifted, j, view)
-        for k in range(points):
-            error = math.sqrt(view[3, k] * view[3, k] + view[4, k] * view[4, k])
-            error = error if view[2, k] < 1.0 / MIN_DEPTH else BEHIND_ERROR
-            errors[j, k] = error if problem.mask[j, k] else 0.0
-    return errors
-
-
-@compiled
-def cost(problem: Problem, state: State) -> float:
-    """Return the cost [px^2] of observations, by Cauchy's loss, and of priors, by squares."""
-    errors, reach = reprojection_errors(problem, state), problem.width ** 2
-    (frames, points), total = errors.shape, 0.0
-    products = np.ones(points)  # Their logarithms are the sums of logarithms.
-    for j in range(frames):
-        for k in range(points):
-            products[k] *= 1.0 + errors[j, k] * errors[j, k] / reach
-    for k in range(points):
-        away = state.points[2, k] - problem.prior_values[k]
-        total += reach * math.log(products[k]) + problem.prior_weights[k] * away * away
-    return total
 
 
 @compiled
@@ -202,15 +132,18 @@ def linearise(problem: Problem, state: State, with_lens: bool) -> NormalEquation
     size = poses + LENS if with_lens else poses
     H_cc, g_c, H_cp = np.zeros((size, size)), np.zeros(size), np.zeros((size, POINT, points))
     H_pp, g_p = np.zeros((6, points)), np.zeros((POINT, points))
-    view, J = np.empty((6, points)), np.empty((POSE + LENS + POINT, 2, points))
-    by_pose, by_lens, by_point = J[:POSE], J[POSE:POSE + LENS], J[POSE + LENS:]
-    rows, residuals = J.reshape(len(J), 2 * points), view[3:5].reshape(2 * points)
-    lifted, slopes = _lift(problem, state.points)
+    space = np.empty((6 + 2 * (POSE + LENS + POINT)) * points)
+    lifted, slopes = lift(problem, state.points)
     for k in range(points):
         H_pp[5, k] = problem.prior_weights[k]
         g_p[2, k] = problem.prior_weights[k] * (state.points[2, k] - problem.prior_values[k])
     for j in range(frames):
-        _project(problem, state, lifted, j, view)
+        seen = seen_by(problem, j)
+        view = space[:6 * seen].reshape(6, seen)
+        J = space[6 * points:][:2 * (POSE + LENS + POINT) * seen].reshape(-1, 2, seen)
+        by_pose, by_lens, by_point = J[:POSE], J[POSE:POSE + LENS], J[POSE + LENS:]
+        rows, residuals = J.reshape(len(J), 2 * seen), view[3:5].reshape(2 * seen)
+        project(problem, state, lifted, j, view)
         _weigh(problem, j, view)
         _differentiate_by_point(state.rotations[j], state.translations[j], slopes, view,
                                 by_point)
@@ -272,7 +205,8 @@ def adjust(problem: Problem, state: State, iterations: int) -> State:
     damping, current = FIRST_DAMPING, cost(problem, state)
     for _ in range(iterations):
         for _ in range(MAX_REJECTIONS):
-            candidate = stepped(state, *step(linearise(problem, state, False), damping))
+            poses, points = step(linearise(problem, state, False), damping)
+            candidate = stepped(state, LONGER * poses, LONGER * points)
             candidate_cost = cost(problem, candidate)
             if candidate_cost < current:
                 break

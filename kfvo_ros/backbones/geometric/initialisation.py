@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,9 +14,10 @@ import poselib
 from kfvo_ros import geometry, track_ids
 from kfvo_ros.backbones.base import Previous
 from kfvo_ros.backbones.geometric import kernels
-from kfvo_ros.backbones.geometric.bundle_adjustment import MIN_DEPTH, State
 from kfvo_ros.backbones.geometric.memory import History, memory_of
 from kfvo_ros.backbones.geometric.observations import Observations
+from kfvo_ros.backbones.geometric.problem import State
+from kfvo_ros.backbones.geometric.reprojection import MIN_DEPTH
 
 MIN_PAIR_TRACKS = 12
 """Two frames with fewer common tracks cannot start a window."""
@@ -23,7 +25,8 @@ MIN_FLOW = 2.0
 """A pair that moved less tells nothing of the relative pose [px]."""
 ENOUGH_TRACKS, ENOUGH_FLOW = 100, 50.0
 """More common tracks, or more flow [px], do not make a pair better."""
-MIN_RESECTION_POINTS = 6
+MIN_RESECTION_POINTS, ENOUGH_POINTS = 6, 100
+"""Of more than so many points only every second, or third, is resected from."""
 NEIGHBOURS = 5
 """So many known points around it tell where a new one is expected."""
 NEAREST, FARTHEST = 0.02, 50.0
@@ -32,7 +35,7 @@ MAX_SPREAD = 0.7
 """... and when one pixel moves them by less than this share of the median."""
 LEAST_INVERSE_DEPTH = 1e-4
 
-RELATIVE_POSE = {'max_epipolar_error': 1.0, 'max_iterations': 500, 'min_iterations': 50}
+RELATIVE_POSE = {'max_epipolar_error': 1.0, 'max_iterations': 500, 'min_iterations': 20}
 ABSOLUTE_POSE = {'max_reproj_error': 3.0, 'max_iterations': 200, 'min_iterations': 5}
 REFINEMENT = {'max_iterations': 5}
 """Of a pose that is adjusted with the whole window next."""
@@ -59,20 +62,36 @@ class Initialiser:
         self._camera = {'model': 'SIMPLE_PINHOLE', 'width': 1, 'height': 1,
                         'params': [focal, 0.0, 0.0]}
 
-    def moved(self, observations: Observations) -> bool:
-        """Return whether the window can be started from nothing."""
-        return self._best_pair(observations) is not None
+    def best_pair(self, observations: Observations) -> tuple[int, int] | None:
+        """Return the two frames whose relative pose is best determined, by tracks and flow.
 
-    def from_nothing(self, observations: Observations) -> Guess:
+        None when the camera did not move.
+        """
+        best, pair = 0.0, None
+        frames = observations.mask.shape[1]
+        for i in range(frames):
+            for j in range(i + 1, frames):
+                both = observations.mask[:, i] & observations.mask[:, j]
+                if both.sum() < MIN_PAIR_TRACKS:
+                    continue
+                shift = observations.seen[both, i] - observations.seen[both, j]
+                flow = self.focal * float(np.median(np.linalg.norm(shift, axis=1)))
+                if flow < MIN_FLOW:
+                    continue
+                score = min(both.sum(), ENOUGH_TRACKS) * min(flow, ENOUGH_FLOW)
+                if score > best:
+                    best, pair = score, (i, j)
+        return pair
+
+    def from_nothing(self, observations: Observations, pair: tuple[int, int] | None) -> Guess:
         """Return poses and depths of a window of which nothing is known, median depth 1.
 
-        The pair of frames with most tracks and flow gives the first two poses, the others are
-        resected one by one from the points triangulated so far. A camera at rest sees all
-        points at depth 1.
+        The `best_pair` of frames gives the first two poses, the others are resected one by one
+        from the points triangulated so far. Without one, a camera at rest, all points are at
+        depth 1.
         """
         frames = observations.mask.shape[1]
         T_first_frame = np.tile(np.eye(4), (frames, 1, 1))
-        pair = self._best_pair(observations)
         if pair is not None:
             first, second = pair
             T_first_frame[second] = self._relative_pose(observations, first, second)
@@ -123,24 +142,6 @@ class Initialiser:
                                                          frame, T_anchor_frame[frame])
         state = self._complete(observations, T_anchor_frame, np.full(len(observations), np.nan))
         return _guess(observations, previous, state, known)
-
-    def _best_pair(self, observations: Observations) -> tuple[int, int] | None:
-        """Return the two frames whose relative pose is best determined."""
-        best, pair = 0.0, None
-        frames = observations.mask.shape[1]
-        for i in range(frames):
-            for j in range(i + 1, frames):
-                both = observations.mask[:, i] & observations.mask[:, j]
-                if both.sum() < MIN_PAIR_TRACKS:
-                    continue
-                shift = observations.seen[both, i] - observations.seen[both, j]
-                flow = self.focal * float(np.median(np.linalg.norm(shift, axis=1)))
-                if flow < MIN_FLOW:
-                    continue
-                score = min(both.sum(), ENOUGH_TRACKS) * min(flow, ENOUGH_FLOW)
-                if score > best:
-                    best, pair = score, (i, j)
-        return pair
 
     def _relative_pose(self, observations: Observations, i: int, j: int) -> np.ndarray:
         """Return T_i_j with a translation of length 1."""
@@ -201,6 +202,7 @@ class Initialiser:
         if usable.sum() < MIN_RESECTION_POINTS:
             return fallback
         rows = np.flatnonzero(usable)
+        rows = rows[::math.ceil(len(rows) / ENOUGH_POINTS)]
         positions = kernels.place(*_rotations_and_translations(T_w_frame),
                                   observations.hosts[rows], observations.rays[rows],
                                   inverse_depths[rows])
@@ -235,7 +237,8 @@ def _poses_before(previous: Previous, history: History) -> np.ndarray:
 def _guess(observations: Observations, previous: Previous, state: State,
            known: np.ndarray) -> Guess:
     """Return the start, with what earlier windows let expect: inverse depths (P,) or NaN."""
-    trusted = np.isfinite(known) & np.isin(observations.ids, memory_of(previous).trusted)
+    trusted = np.isfinite(known) & track_ids.present(observations.ids,
+                                                      memory_of(previous).trusted)
     return Guess(state, _expect(observations, known, state.points[2]), trusted)
 
 

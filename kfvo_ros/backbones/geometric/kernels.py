@@ -12,11 +12,24 @@ import math
 import numpy as np
 
 from kfvo_ros.backbones.geometric import bundle_adjustment as ba
-from kfvo_ros.backbones.geometric import schur
+from kfvo_ros.backbones.geometric import reprojection, schur
 from kfvo_ros.backbones.geometric.compilation import compiled
+from kfvo_ros.backbones.geometric.problem import Problem, State
 
 END = np.iinfo(np.int64).max
 """No track has this id."""
+
+
+@compiled
+def straighten(points, errors):
+    """Return where points (N, 2) lie through a lens with these errors (ba.LENS,), see `Lens`."""
+    straight = np.empty(points.shape)
+    for k in range(len(points)):
+        x, y = points[k]
+        r2 = min(x * x + y * y, ba.WIDE_ANGLE)
+        longer = 1.0 + errors[0] + errors[1] * r2 + errors[2] * r2 * r2
+        straight[k, 0], straight[k, 1] = (x - errors[3]) / longer, (y - errors[4]) / longer
+    return straight
 
 
 @compiled
@@ -244,7 +257,8 @@ def medians_of_nearest(places, known_places, known_values, neighbours):
 def load() -> None:
     """Compile everything, or load it from the cache, before a frame would wait for it."""
     rotations, translations, ones = np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3)), np.ones(1)
-    ids, seen, mask, _ = merge(np.zeros(2, dtype=np.int64), np.zeros((2, 2)), np.zeros(2),
+    points = straighten(np.zeros((2, 2)), np.zeros(ba.LENS))
+    ids, seen, mask, _ = merge(np.zeros(2, dtype=np.int64), points, np.zeros(2),
                                np.array([1, 2]), 1)
     hosts, rays = np.zeros(1, dtype=np.int64), np.ones((1, 3))
     triangulate(rotations, translations, hosts, rays, seen, mask)
@@ -254,10 +268,10 @@ def load() -> None:
     median(ones)
     median_where(np.ones((1, 1)), mask[:, :1])
     count_shared(ids, ids)
-    problem = ba.Problem(hosts, np.tile(np.eye(4), (2, 1, 1)), np.zeros((2, 2, 1)),
-                         np.ones((2, 1), dtype=np.bool_), 1.0, 1, ones, ones, ones, 1.0)
-    state = ba.adjust(problem, ba.State(rotations, translations, np.ones((3, 1))), 1)
-    ba.reprojection_errors(problem, state)
-    ba.cost(problem, state)
+    problem = Problem(hosts, np.tile(np.eye(4), (2, 1, 1)), np.zeros((2, 2, 1)),
+                      np.ones((2, 1), dtype=np.bool_), 1.0, 1, ones, ones, ones, 1.0)
+    state = ba.adjust(problem, State(rotations, translations, np.ones((3, 1))), 1)
+    reprojection.errors(problem, state)
+    reprojection.cost(problem, state)
     schur.reduce(ba.linearise(problem, state, True))
     schur.depth_information(ba.linearise(problem, state, False))

@@ -19,6 +19,7 @@ from functools import cached_property
 import numpy as np
 
 from kfvo_ros.backbones.geometric import bundle_adjustment as ba
+from kfvo_ros.backbones.geometric import kernels
 from kfvo_ros.backbones.geometric.problem import Problem, State
 from kfvo_ros.backbones.geometric.schur import reduce
 from kfvo_ros.camera import Camera
@@ -56,9 +57,7 @@ class Lens:
 
     def straighten(self, points: np.ndarray) -> np.ndarray:
         """Return where points (N, 2) lie, normalised as they are."""
-        near_axis, square, fourth, *axis = self.errors
-        r2 = _off_axis(points)
-        return (points - axis) / (1.0 + near_axis + square * r2 + fourth * r2 * r2)[:, None]
+        return kernels.straighten(points, self.errors)
 
     def new_in(self, indices: Sequence[int]) -> float:
         """Return the share of a window's frames, by their indices, that were not asked yet."""
@@ -85,12 +84,6 @@ class Lens:
         variance = noise ** 2 * (1.0 + correlation) / (1.0 - correlation) / self.new_in(indices)
         known = self.information + information / variance
         return Lens(self.errors + np.linalg.solve(known, pull / variance), known, indices[-1])
-
-
-def _off_axis(points: np.ndarray) -> np.ndarray:
-    """Return r^2 (N,) of points (N, 2)."""
-    x, y = points.T
-    return np.minimum(x * x + y * y, ba.WIDE_ANGLE)
 
 
 def marginal(problem: Problem, state: State) -> tuple[np.ndarray, np.ndarray]:

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -98,6 +99,6 @@ def recall(memory: Memory, scale: float, anchor: View) -> History:
 def _differ(memory: Memory, older: int, newer: int) -> bool:
     """Return whether the camera had moved on, and enough of the older view's tracks had ended."""
     before, after = memory.views[older].tracks.ids, memory.views[newer].tracks.ids
-    T_older_newer = geometry.relative(memory.T_anchor_view[older], memory.T_anchor_view[newer])
-    return bool(np.linalg.norm(T_older_newer[:3, 3]) > LEAST_BASELINE * memory.depth
+    way = memory.T_anchor_view[newer, :3, 3] - memory.T_anchor_view[older, :3, 3]
+    return bool(math.hypot(*way) > LEAST_BASELINE * memory.depth
                 and kernels.count_shared(before, after) < MAX_SHARED * len(before))

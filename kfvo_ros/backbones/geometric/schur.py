@@ -109,10 +109,11 @@ def _eliminate(normal: NormalEquations, damping: float,
 
 @compiled
 def reduce(normal: NormalEquations) -> tuple[np.ndarray, np.ndarray]:
-    """Eliminate the points (Schur complement); return system and gradient of the poses."""
-    H_cc, g_c, H_cp, H_pp, g_p = normal
-    return _eliminate(NormalEquations(H_cc, g_c, H_cp.copy(), H_pp, g_p.copy()), 0.0,
-                      _factor(H_pp, 0.0))
+    """Eliminate the points (Schur complement); return system and gradient of the poses.
+
+    The equations are used up: a copy of them would not fit into the processor's cache.
+    """
+    return _eliminate(normal, 0.0, _factor(normal.H_pp, 0.0))
 
 
 @compiled
@@ -136,7 +137,7 @@ def _solve(system: np.ndarray, right: np.ndarray) -> np.ndarray:
 def step(normal: NormalEquations, damping: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the damped Gauss-Newton step of free poses (C,) and points (3, P).
 
-    The equations are used up: a copy of them would not fit into the processor's cache.
+    The equations are used up.
     """
     L = _factor(normal.H_pp, damping)
     poses = -_solve(*_eliminate(normal, damping, L))

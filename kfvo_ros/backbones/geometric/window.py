@@ -13,14 +13,14 @@ import numpy as np
 from kfvo_ros import geometry
 from kfvo_ros.backbones.base import Points, Previous
 from kfvo_ros.backbones.geometric import bundle_adjustment as ba
-from kfvo_ros.backbones.geometric import kernels
+from kfvo_ros.backbones.geometric import kernels, reprojection
 from kfvo_ros.backbones.geometric.initialisation import Guess, Initialiser
 from kfvo_ros.backbones.geometric.memory import History, memory_of
 from kfvo_ros.backbones.geometric.observations import Observations
-from kfvo_ros.backbones.geometric.problem import NormalEquations
+from kfvo_ros.backbones.geometric.problem import Problem, State
 from kfvo_ros.backbones.geometric.schur import depth_information, reduce
 
-ITERATIONS, FINAL_ITERATIONS = 3, 4
+ITERATIONS, FINAL_ITERATIONS = 3, 3
 WIDE = 1.0
 """Width of the loss at first [px]: a rough start is pulled from afar."""
 NARROW = 1.7
@@ -60,9 +60,8 @@ class Solution:
 
     observations: Observations
     anchor: int
-    problem: ba.Problem
-    state: ba.State
-    normal: NormalEquations
+    problem: Problem
+    state: State
 
     @property
     def solved(self) -> np.ndarray:
@@ -104,19 +103,20 @@ class Solution:
     @cached_property
     def noise(self) -> float:
         """How far the tracks that are left are off [px]."""
-        return _noise(self.problem, ba.reprojection_errors(self.problem, self.state))
+        return _noise(self.problem, reprojection.errors(self.problem, self.state))
 
     @cached_property
     def points(self) -> Points:
         """Return the solved points; a depth's information is that given the poses."""
         rows = np.flatnonzero(self.solved)
+        given_poses = self.problem._replace(fixed=len(self.problem.mask))
+        information = depth_information(ba.linearise(given_poses, self.state, False))
         x, y, r = (part[rows] for part in self.state.points)
         origins = self.problem.origins
         positions = kernels.place(origins[:, :3, :3].copy(), origins[:, :3, 3].copy(),
                                   self.problem.hosts[rows],
                                   np.stack([x, y, np.ones(len(rows))], axis=1), r)
-        return Points(self.observations.ids[rows], positions,
-                      depth_information(self.normal)[rows] * r ** 2)
+        return Points(self.observations.ids[rows], positions, information[rows] * r ** 2)
 
     def covariance(self) -> np.ndarray:
         """Return covariances (S, 6, 6) from the anchor on, in it, translation first.
@@ -124,7 +124,7 @@ class Solution:
         It contains how well the window's scale is tied to the past, by history and depth
         priors: where points have no parallax it grows, which reprojection errors do not show.
         """
-        system, _ = reduce(self.normal)
+        system, _ = reduce(ba.linearise(self.problem, self.state, False))
         free = len(system) // 6
         blocks = self.noise ** 2 * _inverse(system).reshape(free, 6, free, 6)
         turns = np.zeros((free, 6, 6))
@@ -139,23 +139,28 @@ def solve(observations: Observations, initialiser: Initialiser, previous: Previo
           history: History) -> Solution:
     """Place the frames of a window in the anchor, in the unit of `previous`, else median depth 1.
 
-    The one from the last window may sit in a wrong minimum. While little is known, a start from
-    nothing competes with it; where the window is doubted, one from its history.
+    A draft moves the newest frame alone: the others hardly change. But what the last window found
+    may be a wrong minimum. While little is known, a start from nothing competes with it; where
+    the window is doubted, one from its history; and these drafts move all frames.
     """
-    anchor, focal = len(history.views), initialiser.focal
+    anchor, certain = len(history.views), memory_of(previous).certain
+    settled = certain and not history.doubted
+    fixed = observations.mask.shape[1] - 1 if settled else anchor + 1
+
+    def draft(guess: Guess) -> _Draft:
+        return _draft(observations, initialiser.focal, guess, fixed)
+
     drafts = []
     if previous is not None and previous.points is not None:
-        guess = initialiser.from_previous(observations, previous, history)
-        drafts.append(_draft(observations, focal, guess, anchor))
+        drafts.append(draft(initialiser.from_previous(observations, previous, history)))
         if drafts[0].newest_inlier_share < SUSPICIOUS_SHARE:
-            guess = initialiser.from_previous(observations, previous, history, True)
-            drafts.append(_draft(observations, focal, guess, anchor))
+            drafts.append(draft(initialiser.from_previous(observations, previous, history, True)))
         if history.doubted:
-            guess = initialiser.from_history(observations, previous, history)
-            drafts.append(_draft(observations, focal, guess, anchor))
-    if not drafts or (not memory_of(previous).certain and initialiser.moved(observations)):
-        guess = initialiser.from_nothing(observations)
-        drafts.append(_draft(observations, focal, guess, anchor))
+            drafts.append(draft(initialiser.from_history(observations, previous, history)))
+    if not certain:
+        pair = initialiser.best_pair(observations)
+        if pair is not None or not drafts:
+            drafts.append(draft(initialiser.from_nothing(observations, pair)))
     return _finish(observations, min(drafts, key=lambda draft: draft.cost), anchor)
 
 
@@ -163,8 +168,8 @@ def solve(observations: Observations, initialiser: Initialiser, previous: Previo
 class _Draft:
     """A window adjusted with all its observations, of which ``inliers`` (F, P) fit."""
 
-    problem: ba.Problem
-    state: ba.State
+    problem: Problem
+    state: State
     inliers: np.ndarray
     noise: float
     cost: float
@@ -175,25 +180,26 @@ class _Draft:
         return float(self.inliers[-1].sum()) / max(1, self.problem.mask[-1].sum())
 
 
-def _draft(observations: Observations, focal: float, guess: Guess, anchor: int) -> _Draft:
+def _draft(observations: Observations, focal: float, guess: Guess, fixed: int) -> _Draft:
     """Adjust from a guess and tell the outliers: a track that is wrong once has slid before."""
-    problem = _problem(observations, focal, guess, anchor + 1)
+    problem = _problem(observations, focal, guess, fixed)
     state = ba.adjust(problem, guess.state, ITERATIONS)
-    errors = ba.reprojection_errors(problem, state)
+    errors = reprojection.errors(problem, state)
     noise = _noise(problem, errors)
     largest = errors.max(axis=0) / problem.certainty
     fits = largest <= np.clip(MAX_NOISE * noise, *MAX_ERROR)
-    return _Draft(problem, state, problem.mask & fits, noise, ba.cost(problem, state))
+    return _Draft(problem, state, problem.mask & fits, noise, reprojection.cost(problem, state))
 
 
 def _finish(observations: Observations, draft: _Draft, anchor: int) -> Solution:
     """Adjust again without the outliers, narrowly."""
-    problem = draft.problem._replace(mask=draft.inliers, width=NARROW * draft.noise)
+    problem = draft.problem._replace(mask=draft.inliers, width=NARROW * draft.noise,
+                                     fixed=anchor + 1)
     state = ba.adjust(problem, draft.state, FINAL_ITERATIONS)
-    return Solution(observations, anchor, problem, state, ba.linearise(problem, state, False))
+    return Solution(observations, anchor, problem, state)
 
 
-def _noise(problem: ba.Problem, errors: np.ndarray) -> float:
+def _noise(problem: Problem, errors: np.ndarray) -> float:
     """Return the median of errors (F, P), had they not been fitted; 1 without any [px]."""
     typical, count = kernels.median_where(errors, problem.mask)
     if not count:
@@ -203,13 +209,13 @@ def _noise(problem: ba.Problem, errors: np.ndarray) -> float:
     return max(LEAST_NOISE, typical / math.sqrt(left))
 
 
-def _problem(observations: Observations, focal: float, guess: Guess, fixed: int) -> ba.Problem:
+def _problem(observations: Observations, focal: float, guess: Guess, fixed: int) -> Problem:
     """Return the bundle adjustment of a window, depths drawn to where they are expected."""
     expected = guess.expected_inverse_depths
     strength = np.where(guess.trusted, TRUSTED_DEPTH_PRIOR, DEPTH_PRIOR)
     spread = np.maximum(expected, LEAST_PRIOR_SPREAD * kernels.median(expected))
     origins = geometry.make_transform(guess.state.rotations, guess.state.translations)
-    return ba.Problem(observations.hosts, origins,
+    return Problem(observations.hosts, origins,
                       np.ascontiguousarray(observations.seen.transpose(1, 2, 0)),
                       np.ascontiguousarray(observations.mask.T),
                       focal, fixed, observations.certainty, strength / spread ** 2, expected,
