@@ -17,7 +17,6 @@ from kfvo_ros import __version__
 from kfvo_ros.commands import make_parser, run_command
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.interruption import Interrupted, signals_collected
-from kfvo_ros.keyframes import HEURISTICS
 from kfvo_ros.learning.witness import Witness
 
 if TYPE_CHECKING:
@@ -64,14 +63,14 @@ def _train(argv: list[str]) -> None:
         backbone = assembly.make_backbone(chosen.odometry, chosen.vggt)
         plan = chosen.plan(arguments.sequence, arguments.validation, backbone)
         checkpoint = read_checkpoint(files.checkpoint, plan) if arguments.resume else None
-        validation, references = _validation(plan, chosen, backbone)
+        validation, scores = _validation(plan, chosen, backbone)
         with closing(make_environment(
                 chosen.lesson(plan), plan.recipe.environments, arguments.workers,
                 plan.seed_at(checkpoint.steps if checkpoint else 0))) as environment:
             files.prepare(arguments.resume)
             about = {'version': __version__,
                      'command': shlex.join(['python', '-m', 'kfvo_ros.train', *argv])}
-            _learn(Training(plan, environment, files, validation, references, about, checkpoint),
+            _learn(Training(plan, environment, files, validation, scores, about, checkpoint),
                    files)
 
 
@@ -136,8 +135,7 @@ def _validation(plan: Plan, chosen: Choices, backbone: Backbone
     from tqdm import tqdm
 
     from kfvo_ros import assembly
-    from kfvo_ros.keyframes.rail import NO_RAIL
-    from kfvo_ros.learning.railed import Taught
+    from kfvo_ros.learning.references import references
     from kfvo_ros.learning.validation import Validation
     if not plan.validation:
         print('no validation: the last policy is the one that is kept; name sequences with '
@@ -148,16 +146,11 @@ def _validation(plan: Plan, chosen: Choices, backbone: Backbone
               for text in tqdm(plan.validation, unit='sequence', desc='validation')]
     validation = Validation(drives, backbone, assembly.setting_of(chosen.odometry, backbone))
     print(f'{f"{len(drives)} sequences":<26}{"ATE of path":>12}{"keyframes":>16}')
-    policies = {name: assembly.make_policy(replace(chosen.odometry, keyframes=name), backbone)
-                for name in HEURISTICS}
-    if plan.recipe.teacher is not None:
-        policies[Taught.name] = Taught(plan.recipe.rail or NO_RAIL, plan.recipe.teacher,
-                                       validation.setting.observation)
-    references = {}
-    for name, policy in policies.items():
-        references[name] = validation.score(policy)
-        print(_row(name, references[name]), flush=True)
-    return validation, references
+    scores = {}
+    for name, policy in references(plan.recipe, chosen.odometry, backbone).items():
+        scores[name] = validation.score(policy)
+        print(_row(name, scores[name]), flush=True)
+    return validation, scores
 
 
 def _choose(arguments: argparse.Namespace) -> Choices:

@@ -5,20 +5,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from kfvo_ros import assembly, metrics
 from kfvo_ros.backbones.base import Backbone
-from kfvo_ros.keyframes import HEURISTICS
 from kfvo_ros.keyframes.base import KeyframePolicy
 from kfvo_ros.keyframes.learned import Setting
 from kfvo_ros.keyframes.rail import NO_RAIL
 from kfvo_ros.learning.ablation_table import Outcome
 from kfvo_ros.learning.drives import Drive
-from kfvo_ros.learning.railed import RailAlone, Random, Taught
+from kfvo_ros.learning.railed import RailAlone, Random
 from kfvo_ros.learning.recipe import Recipe
+from kfvo_ros.learning.references import references
 from kfvo_ros.learning.validation import LEAST_PERCENT, Validation
 from kfvo_ros.options import OdometryOptions
 from kfvo_ros.trajectory import Trajectory
@@ -52,12 +52,8 @@ class Examination:
         And no odometry at all.
         """
         rail = recipe.rail or NO_RAIL
-        for name in HEURISTICS:
-            options = replace(self.options, keyframes=name)
-            yield from self.outcomes(name, None, assembly.make_policy(options, self.backbone))
-        if recipe.teacher is not None:
-            yield from self.outcomes(Taught.name, None, Taught(rail, recipe.teacher,
-                                                               self.setting.observation))
+        for name, policy in references(recipe, self.options, self.backbone).items():
+            yield from self.outcomes(name, None, policy)
         for seed in DICE:
             yield from self.outcomes(Random.name, seed, Random(rail, seed))
         if recipe.rail is not None:
