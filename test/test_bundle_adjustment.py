@@ -224,6 +224,22 @@ def test_points_that_are_doubted_count_less():
     assert off[1] < 0.1 * off[0]
 
 
+@pytest.mark.parametrize('blind', (0, 2, FRAMES - 1))
+def test_a_frame_that_sees_nothing_says_nothing_and_stays(blind):
+    problem, truth = window(noise=0.3, fixed=1)
+    mask = problem.mask.copy()
+    mask[blind] = False
+    problem = problem._replace(mask=mask)
+    normal, pose = ba.linearise(problem, truth, True), 6 * (blind - 1)
+    assert not reprojection.errors(problem, truth)[blind].any()
+    if blind > 0:
+        assert not normal.H_cc[pose:pose + 6].any() and not normal.H_cp[pose:pose + 6].any()
+    found = ba.adjust(problem, truth, 3)
+    assert reprojection.cost(problem, found) < reprojection.cost(problem, truth)
+    assert np.array_equal(found.rotations[blind], truth.rotations[blind])
+    assert np.array_equal(found.translations[blind], truth.translations[blind])
+
+
 def test_a_host_is_believed_no_more_than_others():
     """Where nothing moves, its noise taken for truth would be parallax of one sign.
 

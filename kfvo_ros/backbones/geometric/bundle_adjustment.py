@@ -132,7 +132,8 @@ def linearise(problem: Problem, state: State, with_lens: bool) -> NormalEquation
     size = poses + LENS if with_lens else poses
     H_cc, g_c, H_cp = np.zeros((size, size)), np.zeros(size), np.zeros((size, POINT, points))
     H_pp, g_p = np.zeros((6, points)), np.zeros((POINT, points))
-    space = np.empty((6 + 2 * (POSE + LENS + POINT)) * points)
+    derivatives = POSE + LENS + POINT
+    space = np.empty((6 + 2 * derivatives) * points)
     lifted, slopes = lift(problem, state.points)
     for k in range(points):
         H_pp[5, k] = problem.prior_weights[k]
@@ -140,9 +141,9 @@ def linearise(problem: Problem, state: State, with_lens: bool) -> NormalEquation
     for j in range(frames):
         seen = seen_by(problem, j)
         view = space[:6 * seen].reshape(6, seen)
-        J = space[6 * points:][:2 * (POSE + LENS + POINT) * seen].reshape(-1, 2, seen)
+        J = space[6 * points:][:2 * derivatives * seen].reshape(derivatives, 2, seen)
         by_pose, by_lens, by_point = J[:POSE], J[POSE:POSE + LENS], J[POSE + LENS:]
-        rows, residuals = J.reshape(len(J), 2 * seen), view[3:5].reshape(2 * seen)
+        rows, residuals = J.reshape(derivatives, 2 * seen), view[3:5].reshape(2 * seen)
         project(problem, state, lifted, j, view)
         _weigh(problem, j, view)
         _differentiate_by_point(state.rotations[j], state.translations[j], slopes, view,

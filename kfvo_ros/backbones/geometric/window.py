@@ -161,7 +161,7 @@ def solve(observations: Observations, initialiser: Initialiser, previous: Previo
         pair = initialiser.best_pair(observations)
         if pair is not None or not drafts:
             drafts.append(draft(initialiser.from_nothing(observations, pair)))
-    return _finish(observations, min(drafts, key=lambda draft: draft.cost), anchor)
+    return _finish(observations, min(drafts, key=lambda each: each.cost), anchor)
 
 
 @dataclass(frozen=True)
