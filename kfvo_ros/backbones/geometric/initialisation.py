@@ -237,9 +237,9 @@ def _poses_before(previous: Previous, history: History) -> np.ndarray:
 def _guess(observations: Observations, previous: Previous, state: State,
            known: np.ndarray) -> Guess:
     """Return the start, with what earlier windows let expect: inverse depths (P,) or NaN."""
-    trusted = np.isfinite(known) & track_ids.present(observations.ids,
-                                                      memory_of(previous).trusted)
-    return Guess(state, _expect(observations, known, state.points[2]), trusted)
+    measured = track_ids.present(observations.ids, memory_of(previous).trusted)
+    return Guess(state, _expect(observations, known, state.points[2]),
+                 np.isfinite(known) & measured)
 
 
 def known_inverse_depths(observations: Observations, T_anchor_frame: np.ndarray,

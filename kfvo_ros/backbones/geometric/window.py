@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -146,10 +146,7 @@ def solve(observations: Observations, initialiser: Initialiser, previous: Previo
     anchor, certain = len(history.views), memory_of(previous).certain
     settled = certain and not history.doubted
     fixed = observations.mask.shape[1] - 1 if settled else anchor + 1
-
-    def draft(guess: Guess) -> _Draft:
-        return _draft(observations, initialiser.focal, guess, fixed)
-
+    draft = partial(_draft, observations, initialiser.focal, fixed)
     drafts = []
     if previous is not None and previous.points is not None:
         drafts.append(draft(initialiser.from_previous(observations, previous, history)))
@@ -180,7 +177,7 @@ class _Draft:
         return float(self.inliers[-1].sum()) / max(1, self.problem.mask[-1].sum())
 
 
-def _draft(observations: Observations, focal: float, guess: Guess, fixed: int) -> _Draft:
+def _draft(observations: Observations, focal: float, fixed: int, guess: Guess) -> _Draft:
     """Adjust from a guess and tell the outliers: a track that is wrong once has slid before."""
     problem = _problem(observations, focal, guess, fixed)
     state = ba.adjust(problem, guess.state, ITERATIONS)
@@ -216,10 +213,9 @@ def _problem(observations: Observations, focal: float, guess: Guess, fixed: int)
     spread = np.maximum(expected, LEAST_PRIOR_SPREAD * kernels.median(expected))
     origins = geometry.make_transform(guess.state.rotations, guess.state.translations)
     return Problem(observations.hosts, origins,
-                      np.ascontiguousarray(observations.seen.transpose(1, 2, 0)),
-                      np.ascontiguousarray(observations.mask.T),
-                      focal, fixed, observations.certainty, strength / spread ** 2, expected,
-                      WIDE)
+                   np.ascontiguousarray(observations.seen.transpose(1, 2, 0)),
+                   np.ascontiguousarray(observations.mask.T),
+                   focal, fixed, observations.certainty, strength / spread ** 2, expected, WIDE)
 
 
 def _inverse(system: np.ndarray) -> np.ndarray:
