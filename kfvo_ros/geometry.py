@@ -81,19 +81,25 @@ def quat_xyzw_from_rotation(rotation: np.ndarray) -> np.ndarray:
     The largest of the four candidates is taken, so no angle loses digits (Shepperd 1978).
     """
     r = np.asarray(rotation, dtype=np.float64)
-    d0, d1, d2 = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
-    sum01, sum02, sum12 = (r[..., 1, 0] + r[..., 0, 1], r[..., 2, 0] + r[..., 0, 2],
-                           r[..., 2, 1] + r[..., 1, 2])
-    dif0, dif1, dif2 = (r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0],
-                        r[..., 1, 0] - r[..., 0, 1])
-    candidates = np.array([[1 + d0 - d1 - d2, sum01, sum02, dif0],
-                           [sum01, 1 - d0 + d1 - d2, sum12, dif1],
-                           [sum02, sum12, 1 - d0 - d1 + d2, dif2],
-                           [dif0, dif1, dif2, 1 + d0 + d1 + d2]])
-    largest = np.diagonal(candidates).argmax(axis=-1)
-    quaternion = np.choose(largest[..., None], np.moveaxis(candidates, 1, -1))
-    length = np.sqrt((quaternion * quaternion).sum(axis=-1, keepdims=True))
-    return quaternion / np.copysign(length, quaternion[..., 3:])
+    candidates = (r.reshape(-1, 9) @ _SLOPES + _OFFSET).reshape(-1, 4, 4)
+    largest = candidates.diagonal(axis1=1, axis2=2).argmax(axis=1)
+    quaternion = candidates[np.arange(len(candidates)), largest]
+    length = np.sqrt((quaternion * quaternion).sum(axis=1, keepdims=True))
+    return (quaternion / np.copysign(length, quaternion[:, 3:])).reshape(*r.shape[:-2], 4)
+
+
+def _quaternions(r: np.ndarray) -> np.ndarray:
+    """Return four multiples (4, 4) of a rotation's quaternion, by x, y, z and w: 4 q q^T."""
+    x, y, z = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
+    xy, xz, yz = r[1, 0] + r[0, 1], r[2, 0] + r[0, 2], r[2, 1] + r[1, 2]
+    (a, _, _), (_, b, _), (_, _, c) = r
+    return np.array([[1.0 + a - b - c, xy, xz, x], [xy, 1.0 - a + b - c, yz, y],
+                     [xz, yz, 1.0 - a - b + c, z], [x, y, z, 1.0 + a + b + c]])
+
+
+# They are linear in the rotation, so one product makes those of many.
+_OFFSET = _quaternions(np.zeros((3, 3))).ravel()
+_SLOPES = np.array([_quaternions(unit.reshape(3, 3)).ravel() - _OFFSET for unit in np.eye(9)])
 
 
 def rotation_from_quat_xyzw(quat_xyzw: np.ndarray) -> np.ndarray:

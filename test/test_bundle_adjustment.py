@@ -66,7 +66,7 @@ def disturbed(problem: Problem, state: State, size: float = 1.0) -> State:
 
 
 def half_gradient(problem: Problem, state: State) -> np.ndarray:
-    normal = ba.linearise(problem, state, False)
+    normal = ba.linearise(problem, state, False, np.float64)
     return np.concatenate([normal.g_c, normal.g_p.ravel()])
 
 
@@ -102,7 +102,7 @@ def test_gradient_is_that_of_half_the_cost(fixed, width):
 
 def test_hessian_is_the_derivative_of_the_gradient_where_residuals_vanish():
     problem, state = window(fixed=2, prior=30.0)
-    normal, eps = ba.linearise(problem, state, False), 1e-6
+    normal, eps = ba.linearise(problem, state, False, np.float64), 1e-6
     size, H = len(normal.g_c), dense(normal)
     indices = [*range(size), *range(size, size + 3 * POINTS, 7)]
     numeric = np.array([
@@ -113,19 +113,22 @@ def test_hessian_is_the_derivative_of_the_gradient_where_residuals_vanish():
 
 
 @pytest.mark.parametrize('damping', [1e-4, 1.0])
-def test_schur_step_is_the_dense_step(damping):
+@pytest.mark.parametrize(('precision', 'rtol', 'atol'),
+                         [(np.float64, 1e-5, 1e-9), (np.float32, 1e-3, 1e-6)])
+def test_schur_step_is_the_dense_step(damping, precision, rtol, atol):
     problem, truth = window(noise=1.0, prior=3.0)
-    normal = ba.linearise(problem, disturbed(problem, truth), False)
-    H, gradient = dense(normal), np.concatenate([normal.g_c, normal.g_p.ravel()])
+    state = disturbed(problem, truth)
+    H = dense(ba.linearise(problem, state, False, np.float64))
     H[np.diag_indices(len(H))] *= 1.0 + damping
-    poses, points = schur.step(normal, damping)
+    poses, points = schur.step(ba.linearise(problem, state, False, precision), damping)
     np.testing.assert_allclose(np.concatenate([poses, points.ravel()]),
-                               -np.linalg.solve(H, gradient), rtol=1e-5, atol=1e-9)
+                               -np.linalg.solve(H, half_gradient(problem, state)),
+                               rtol=rtol, atol=atol)
 
 
 def test_a_reduced_system_knows_what_the_dense_one_knows():
     problem, truth = window(noise=1.0, prior=3.0)
-    normal = ba.linearise(problem, truth, False)
+    normal = ba.linearise(problem, truth, False, np.float64)
     size, inverse = len(normal.g_c), np.linalg.inv(dense(normal))
     system, gradient = schur.reduce(normal)
     np.testing.assert_allclose(np.linalg.inv(system), inverse[:size, :size], rtol=1e-4)
@@ -135,9 +138,9 @@ def test_a_reduced_system_knows_what_the_dense_one_knows():
 
 def test_what_is_known_of_a_depth_leaves_its_ray_open():
     problem, truth = window(noise=1.0, prior=3.0)
-    normal = ba.linearise(problem, truth, False)
+    normal = ba.linearise(problem, truth, False, np.float64)
     variances = np.linalg.inv(dense(normal)[len(normal.g_c):, len(normal.g_c):]).diagonal()
-    given_poses = ba.linearise(problem._replace(fixed=FRAMES), truth, False)
+    given_poses = ba.linearise(problem._replace(fixed=FRAMES), truth, False, np.float64)
     assert not given_poses.H_cc.size
     np.testing.assert_allclose(schur.depth_information(given_poses), 1.0 / variances[2 * POINTS:],
                                rtol=1e-5)
@@ -197,7 +200,7 @@ def test_points_behind_a_camera_count_without_pulling():
     behind = State(turned, state.translations, state.points)
     errors = reprojection.errors(problem, behind)
     assert (errors[-1] == reprojection.BEHIND_ERROR).all()
-    normal = ba.linearise(problem, behind, False)
+    normal = ba.linearise(problem, behind, False, np.float64)
     assert np.isfinite(normal.H_cc).all()
     assert not normal.g_c[-6:].any()
 
@@ -230,7 +233,7 @@ def test_a_frame_that_sees_nothing_says_nothing_and_stays(blind):
     mask = problem.mask.copy()
     mask[blind] = False
     problem = problem._replace(mask=mask)
-    normal, pose = ba.linearise(problem, truth, True), 6 * (blind - 1)
+    normal, pose = ba.linearise(problem, truth, True, np.float64), 6 * (blind - 1)
     assert not reprojection.errors(problem, truth)[blind].any()
     if blind > 0:
         assert not normal.H_cc[pose:pose + 6].any() and not normal.H_cp[pose:pose + 6].any()
@@ -270,8 +273,8 @@ def test_a_narrow_loss_lets_tracks_go_that_slide_a_little():
 
 def test_equations_with_the_lens_are_those_of_bent_points():
     problem, truth = window(noise=0.3, prior=3.0)
-    normal, poses = ba.linearise(problem, truth, True), 6 * (FRAMES - 1)
-    plain = ba.linearise(problem, truth, False)
+    normal, poses = ba.linearise(problem, truth, True, np.float64), 6 * (FRAMES - 1)
+    plain = ba.linearise(problem, truth, False, np.float64)
     assert np.array_equal(normal.H_cc[:poses, :poses], plain.H_cc)
     assert np.array_equal(normal.g_p, plain.g_p)
     where, eps = project(problem, truth), 1e-6

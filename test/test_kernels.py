@@ -18,14 +18,15 @@ def test_no_frame_waits_for_the_compiler():
     script = textwrap.dedent('''
         import sys
         from numba.core.dispatcher import Dispatcher
-        from kfvo_ros.backbones.geometric import bundle_adjustment, kernels, reprojection, schur
+        from kfvo_ros.backbones.geometric import (
+            bundle_adjustment, kernels, medians, reprojection, schur)
         from kfvo_ros.backbones.geometric.backbone import GeometricBackbone
         from kfvo_ros.keyframes.heuristics import Every
         from kfvo_ros.odometry import KeyframeOdometry
         from kfvo_ros.sequences.synthetic import SyntheticSequence
 
         def signatures():
-            modules = (bundle_adjustment, kernels, reprojection, schur)
+            modules = (bundle_adjustment, kernels, medians, reprojection, schur)
             return {name: len(kernel.signatures) for module in modules
                     for name, kernel in vars(module).items()
                     if isinstance(kernel, Dispatcher) and not name.startswith('_')}
@@ -37,20 +38,11 @@ def test_no_frame_waits_for_the_compiler():
                     for frame in SyntheticSequence(0, 'fast', 14, 320, 240)]
         assert statuses[-1] == 'ok', statuses
         print(before, signatures())
-        sys.exit(not before or max(before.values()) != 1 or signatures() != before)
+        sys.exit(not before or min(before.values()) == 0 or signatures() != before)
     ''')
     done = subprocess.run([sys.executable, '-c', script], capture_output=True, text=True,
                           timeout=120)
     assert done.returncode == 0, done.stdout + done.stderr
-
-
-@pytest.mark.parametrize('count', range(1, 12))
-def test_median_is_that_of_numpy(count):
-    rng = np.random.default_rng(count)
-    for values in (rng.normal(size=count), rng.integers(0, 4, count).astype(np.float64)):
-        before = values.copy()
-        assert kernels.median(values) == np.median(values)
-        assert np.array_equal(values, before)
 
 
 def test_nearest_known_points_tell_the_median():
@@ -59,15 +51,6 @@ def test_nearest_known_points_tell_the_median():
     distances = np.linalg.norm(places[:, None] - known, axis=2)
     expected = np.median(values[np.argsort(distances, axis=1)[:, :5]], axis=1)
     assert np.array_equal(kernels.medians_of_nearest(places, known, values, 5), expected)
-
-
-@pytest.mark.parametrize('share', [0.0, 0.3, 1.0])
-def test_median_where_there_is_something_is_that_of_numpy(share):
-    rng = np.random.default_rng(3)
-    values, mask = rng.random((6, 25)), rng.random((6, 25)) < share
-    typical, count = kernels.median_where(values, mask)
-    assert count == mask.sum()
-    assert typical == (np.median(values[mask]) if count else 0.0)
 
 
 @pytest.mark.parametrize('sizes', [(0, 3), (7, 0), (30, 12), (12, 30)])

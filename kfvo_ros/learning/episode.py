@@ -115,8 +115,9 @@ class Episode:
 
     def _recent(self) -> tuple[np.ndarray, np.ndarray]:
         """Return estimated and true poses (S, 4, 4) of the last input frames, as known now."""
-        return (np.array([placed.keyframe.T_world_camera for placed in self._trail])
-                @ np.array([placed.T_keyframe_camera for placed in self._trail]),
+        keyframes = np.concatenate([placed.keyframe.T_world_camera for placed in self._trail])
+        offsets = np.concatenate([placed.T_keyframe_camera for placed in self._trail])
+        return (keyframes.reshape(-1, 4, 4) @ offsets.reshape(-1, 4, 4),
                 self._drive.T_truth_camera[self._next - len(self._trail):self._next])
 
 

@@ -28,8 +28,6 @@ from kfvo_ros.tracking import FEATURES, Tracker
 THUMBNAIL = (8, 6)
 MIN_TRACKS = 12
 """The newest frame needs as many tracks in common with the window to be placed."""
-HELD_PARALLAX = 1.0
-"""With less parallax to every keyframe of the window a frame tells nothing of translation [px]."""
 
 
 class GeometricStream(Stream):
@@ -107,7 +105,7 @@ def _estimate(window: Window, stream: GeometricStream) -> Estimate:
     lens = _lens(memory, solution, views, stream.camera)
     return Estimate(poses[solution.anchor:], solution.covariance, solution.points,
                     signals(solution, motion),
-                    Status.HELD if motion.window_parallax < HELD_PARALLAX else Status.OK,
+                    Status.HELD if motion.held else Status.OK,
                     Memory(history.views + views, poses, solution.median_depth,
                            measured=memory.measured or solution.measured,
                            unmeasured=memory.unmeasured if solution.measured else views[-1].index,

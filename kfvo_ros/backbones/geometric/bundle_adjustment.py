@@ -9,6 +9,7 @@ The first frames of a window may be fixed; the others are free.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -23,9 +24,6 @@ MAX_REJECTIONS = 5
 """Steps that may fail in a row before the estimate is taken for a minimum."""
 MIN_IMPROVEMENT = 1e-3
 """A step that lowers the cost by a smaller share is the last one."""
-LONGER = 1.3
-"""Steps go so much farther: Cauchy's loss, which bends less than the parabolas that it is replaced
-by, has its minimum beyond theirs."""
 LEAST_INVERSE_DEPTH = 1e-4
 POSE, LENS, POINT = 6, 5, 3
 """So many numbers each: what a residual depends on, in the order of its derivatives."""
@@ -121,8 +119,9 @@ def _add_coupling(J_m: np.ndarray, J: np.ndarray, H_mp: np.ndarray) -> None:
 
 
 @compiled
-def linearise(problem: Problem, state: State, with_lens: bool) -> NormalEquations:
-    """Return the normal equations at `state`, priors included.
+def linearise(problem: Problem, state: State, with_lens: bool,
+              precision: type[np.floating[Any]]) -> NormalEquations:
+    """Return the normal equations at `state`, priors included, what couples in this `precision`.
 
     With the lens they have LENS rows more, of what is zero now: by what share points lie farther
     off the axis, by what share times r^2 and r^4, r off it, and where the axis is.
@@ -130,7 +129,8 @@ def linearise(problem: Problem, state: State, with_lens: bool) -> NormalEquation
     (frames, points), fixed = problem.mask.shape, problem.fixed
     poses = POSE * (frames - fixed)
     size = poses + LENS if with_lens else poses
-    H_cc, g_c, H_cp = np.zeros((size, size)), np.zeros(size), np.zeros((size, POINT, points))
+    H_cc, g_c = np.zeros((size, size)), np.zeros(size)
+    H_cp = np.zeros((size, POINT, points), precision)
     H_pp, g_p = np.zeros((6, points)), np.zeros((POINT, points))
     derivatives = POSE + LENS + POINT
     space = np.empty((6 + 2 * derivatives) * points)
@@ -206,8 +206,8 @@ def adjust(problem: Problem, state: State, iterations: int) -> State:
     damping, current = FIRST_DAMPING, cost(problem, state)
     for _ in range(iterations):
         for _ in range(MAX_REJECTIONS):
-            poses, points = step(linearise(problem, state, False), damping)
-            candidate = stepped(state, LONGER * poses, LONGER * points)
+            normal = linearise(problem, state, False, np.float32)
+            candidate = stepped(state, *step(normal, damping))
             candidate_cost = cost(problem, candidate)
             if candidate_cost < current:
                 break

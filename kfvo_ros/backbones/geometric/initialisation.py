@@ -13,7 +13,7 @@ import poselib
 
 from kfvo_ros import geometry, track_ids
 from kfvo_ros.backbones.base import Previous
-from kfvo_ros.backbones.geometric import kernels
+from kfvo_ros.backbones.geometric import kernels, medians
 from kfvo_ros.backbones.geometric.memory import History, memory_of
 from kfvo_ros.backbones.geometric.observations import Observations
 from kfvo_ros.backbones.geometric.problem import State
@@ -220,7 +220,7 @@ class Initialiser:
         triangulated, weights = _triangulate(observations, T_anchor_frame)
         believed = triangulated > LEAST_INVERSE_DEPTH
         reference = triangulated[believed] if unknown.all() else inverse_depths[~unknown]
-        median = kernels.median(reference) if len(reference) else 1.0
+        median = medians.median(reference) if len(reference) else 1.0
         believed &= (triangulated > NEAREST * median) & (triangulated < FARTHEST * median)
         believed &= self.focal * np.sqrt(weights) * MAX_SPREAD * median > 1.0
         filled = np.where(unknown, np.where(believed, triangulated, median), inverse_depths)
@@ -264,7 +264,7 @@ def _expect(observations: Observations, known: np.ndarray, filled: np.ndarray) -
     nothing is, as the scene's median.
     """
     is_known = np.isfinite(known)
-    median = kernels.median(known[is_known] if is_known.any() else filled)
+    median = medians.median(known[is_known] if is_known.any() else filled)
     expected = np.where(is_known, known, median)
     visible = observations.mask[:, -1]
     old, new = np.flatnonzero(is_known & visible), np.flatnonzero(~is_known & visible)

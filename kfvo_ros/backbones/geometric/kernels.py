@@ -14,6 +14,7 @@ import numpy as np
 from kfvo_ros.backbones.geometric import bundle_adjustment as ba
 from kfvo_ros.backbones.geometric import reprojection, schur
 from kfvo_ros.backbones.geometric.compilation import compiled
+from kfvo_ros.backbones.geometric.medians import median, median_where
 from kfvo_ros.backbones.geometric.problem import Problem, State
 
 END = np.iinfo(np.int64).max
@@ -34,7 +35,7 @@ def straighten(points, errors):
 
 @compiled
 def merge(ids, points, doubts, ends, first_moving):
-    """Return the tracks (ids, seen, mask, doubts) that two views see, one of them moving.
+    """Return the tracks (ids, seen, mask, hosts, doubts) that two views see, one of them moving.
 
     `ids` (N,), `points` (N, 2) and `doubts` (N,) are those of all views, one after the other; each
     view's ids increase, and end before `ends` (F,). Views from `first_moving` on move. Of doubts
@@ -47,19 +48,20 @@ def merge(ids, points, doubts, ends, first_moving):
     merged = np.empty(len(ids) // 2, dtype=np.int64)
     seen = np.empty((len(merged), frames, 2))
     mask = np.empty((len(merged), frames), dtype=np.bool_)
-    doubted = np.empty(len(merged))
+    hosts, doubted = np.empty(len(merged), dtype=np.int64), np.empty(len(merged))
     while True:
-        lowest, views, last = END, 0, -1
+        lowest, views, first, last = END, 0, -1, -1
         for frame in range(frames):
             head = heads[frame]
             if head < ends[frame] and ids[head] <= lowest:
-                views, last = (views + 1 if ids[head] == lowest else 1), frame
-                lowest = ids[head]
+                if ids[head] < lowest:
+                    lowest, views, first = ids[head], 0, frame
+                views, last = views + 1, frame
         if views == 0:
-            return merged[:count], seen[:count], mask[:count], doubted[:count]
+            return merged[:count], seen[:count], mask[:count], hosts[:count], doubted[:count]
         wanted = views >= 2 and last >= first_moving
         if wanted:
-            merged[count], doubted[count] = lowest, doubts[heads[last]]
+            merged[count], hosts[count], doubted[count] = lowest, first, doubts[heads[last]]
         for frame in range(frames):
             head = heads[frame]
             sees = head < ends[frame] and ids[head] == lowest
@@ -135,50 +137,6 @@ def place(rotations, translations, hosts, rays, inverse_depths):
 
 
 @compiled
-def _select(values, rank):
-    """Return the value of a rank, counted from 0; reorders `values` (Hoare's quickselect)."""
-    first, last = 0, len(values) - 1
-    while first < last:
-        pivot, i, j = values[(first + last) // 2], first, last
-        while i <= j:
-            while values[i] < pivot:
-                i += 1
-            while values[j] > pivot:
-                j -= 1
-            if i <= j:
-                values[i], values[j] = values[j], values[i]
-                i, j = i + 1, j - 1
-        if rank <= j:
-            last = j
-        elif rank >= i:
-            first = i
-        else:
-            break
-    return values[rank]
-
-
-@compiled
-def median(values):
-    """Return the median of (N,), N >= 1: as NumPy's, which spends ten times as long on few."""
-    values = values.copy()
-    half = len(values) // 2
-    upper = _select(values, half)
-    return upper if len(values) % 2 else 0.5 * (upper + _select(values, half - 1))
-
-
-@compiled
-def median_where(values, mask):
-    """Return the median of `values` (F, P) under `mask`, and how many there are; 0 without any."""
-    kept, count = np.empty(values.size), 0
-    for row in range(values.shape[0]):
-        for column in range(values.shape[1]):
-            if mask[row, column]:
-                kept[count] = values[row, column]
-                count += 1
-    return (median(kept[:count]) if count > 0 else 0.0), count
-
-
-@compiled
 def count_shared(a, b):
     """Return how many numbers are both in `a` and in `b`, both increasing."""
     i, j, count = 0, 0, 0
@@ -246,6 +204,8 @@ def medians_of_nearest(places, known_places, known_values, neighbours):
         for k in range(len(known_values)):
             x, y = known_places[k, 0] - places[n, 0], known_places[k, 1] - places[n, 1]
             distance, value = x * x + y * y, known_values[k]
+            if distance >= distances[-1]:
+                continue
             for rank in range(neighbours):
                 if distance < distances[rank]:
                     distance, distances[rank] = distances[rank], distance
@@ -258,9 +218,9 @@ def load() -> None:
     """Compile everything, or load it from the cache, before a frame would wait for it."""
     rotations, translations, ones = np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3)), np.ones(1)
     points = straighten(np.zeros((2, 2)), np.zeros(ba.LENS))
-    ids, seen, mask, _ = merge(np.zeros(2, dtype=np.int64), points, np.zeros(2),
+    ids, seen, mask, hosts, _ = merge(np.zeros(2, dtype=np.int64), points, np.zeros(2),
                                np.array([1, 2]), 1)
-    hosts, rays = np.zeros(1, dtype=np.int64), np.ones((1, 3))
+    rays = np.ones((1, 3))
     triangulate(rotations, translations, hosts, rays, seen, mask)
     place(rotations, translations, hosts, rays, ones)
     median_shifts(seen, mask, 0, correlate(seen, mask, 0))
@@ -273,5 +233,5 @@ def load() -> None:
     state = ba.adjust(problem, State(rotations, translations, np.ones((3, 1))), 1)
     reprojection.errors(problem, state)
     reprojection.cost(problem, state)
-    schur.reduce(ba.linearise(problem, state, True))
-    schur.depth_information(ba.linearise(problem, state, False))
+    schur.reduce(ba.linearise(problem, state, True, np.float64))
+    schur.depth_information(ba.linearise(problem, state, False, np.float64))

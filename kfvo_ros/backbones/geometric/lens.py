@@ -94,7 +94,7 @@ def marginal(problem: Problem, state: State) -> tuple[np.ndarray, np.ndarray]:
     """
     long = problem.mask.sum(axis=0) >= LEAST_VIEWS
     free = problem.of_points(long)._replace(fixed=1)
-    system, gradient = reduce(ba.linearise(free, state.of_points(long), True))
+    system, gradient = reduce(ba.linearise(free, state.of_points(long), True, np.float64))
     poses, lens = slice(0, -ba.LENS), slice(-ba.LENS, None)
     right = np.column_stack([system[poses, lens], gradient[poses]])
     eliminated = system[lens, poses] @ np.linalg.solve(system[poses, poses], right)

@@ -53,12 +53,11 @@ class Observations:
 
 def tabulate(views: Sequence[View], anchor: int, lens: Lens) -> Observations:
     """Gather the tracks of `views`, oldest first, that a frame after the anchor sees."""
-    ids, seen, mask, doubts = kernels.merge(
+    ids, seen, mask, hosts, doubts = kernels.merge(
         np.concatenate([view.tracks.ids for view in views]),
         lens.straighten(np.concatenate([view.points for view in views])),
         np.concatenate([view.tracks.doubts for view in views]),
         np.cumsum([len(view.points) for view in views]), anchor + 1)
-    hosts = mask.argmax(axis=1) if len(ids) else np.zeros(0, dtype=np.int64)
     rays = np.ones((len(ids), 3))
     rays[:, :2] = seen[np.arange(len(ids)), hosts]
     return Observations(ids, seen, mask, hosts, rays,

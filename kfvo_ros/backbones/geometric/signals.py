@@ -10,12 +10,14 @@ import numpy as np
 
 from kfvo_ros import geometry
 from kfvo_ros.backbones.geometric import kernels
-from kfvo_ros.backbones.geometric.observations import View
+from kfvo_ros.backbones.geometric.observations import Observations, View
 from kfvo_ros.backbones.geometric.window import Solution
 from kfvo_ros.tracking import common, mean_flow
 
 SIGNAL_NAMES = ('track_survival', 'flow', 'parallax', 'gap', 'baseline_to_depth', 'rotation',
                 'inlier_share', 'depth_information')
+HELD_PARALLAX = 1.0
+"""With less parallax to every keyframe of the window a frame tells nothing of translation [px]."""
 
 
 @dataclass(frozen=True)
@@ -26,25 +28,33 @@ class Motion:
 
     ``survival`` share of the keyframe's tracks still seen; ``flow`` their mean motion [px], for
     near things are few and count; ``parallax`` (what is left of it after the rotation is taken
-    out) a median [px]; ``window_parallax`` the largest such median against any frame of the
-    window [px]; ``gap`` [input frames].
+    out) a median [px]; ``held`` whether there is next to none to any keyframe of the window;
+    ``gap`` [input frames].
     """
 
     survival: float
     flow: float
     parallax: float
-    window_parallax: float
+    held: bool
     gap: int
 
 
 def measure_motion(solution: Solution, keyframe: View, newest: View, focal: float) -> Motion:
     """Compare the newest frame with the last keyframe and with the whole window."""
     before, after = common(keyframe.tracks, newest.tracks)
-    seen, mask = solution.observations.seen, solution.observations.mask
-    rotations = geometry.nearest_rotation(kernels.correlate(seen, mask, solution.anchor))
-    parallaxes = focal * kernels.median_shifts(seen, mask, solution.anchor, rotations)
+    observations, last = solution.observations, solution.observations.mask.shape[1] - 2
+    parallax = float(focal * _shifts(observations, last)[0])
+    held = bool(parallax < HELD_PARALLAX  # Most frames need not be compared with all the others.
+                and focal * _shifts(observations, solution.anchor).max() < HELD_PARALLAX)
     return Motion(len(before) / max(len(keyframe.tracks), 1), mean_flow(before, after),
-                  float(parallaxes[-1]), float(parallaxes.max()), newest.index - keyframe.index)
+                  parallax, held, newest.index - keyframe.index)
+
+
+def _shifts(observations: Observations, first: int) -> np.ndarray:
+    """Return what rotation leaves of the newest frame's flow against each from `first` on."""
+    seen, mask = observations.seen, observations.mask
+    rotations = geometry.nearest_rotation(kernels.correlate(seen, mask, first))
+    return np.asarray(kernels.median_shifts(seen, mask, first, rotations))
 
 
 def signals(solution: Solution, motion: Motion) -> np.ndarray:

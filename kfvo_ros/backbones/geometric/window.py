@@ -13,14 +13,14 @@ import numpy as np
 from kfvo_ros import geometry
 from kfvo_ros.backbones.base import Points, Previous
 from kfvo_ros.backbones.geometric import bundle_adjustment as ba
-from kfvo_ros.backbones.geometric import kernels, reprojection
+from kfvo_ros.backbones.geometric import kernels, medians, reprojection
 from kfvo_ros.backbones.geometric.initialisation import Guess, Initialiser
 from kfvo_ros.backbones.geometric.memory import History, memory_of
 from kfvo_ros.backbones.geometric.observations import Observations
 from kfvo_ros.backbones.geometric.problem import Problem, State
 from kfvo_ros.backbones.geometric.schur import depth_information, reduce
 
-ITERATIONS, FINAL_ITERATIONS = 3, 3
+ITERATIONS, FINAL_ITERATIONS = 3, 4
 WIDE = 1.0
 """Width of the loss at first [px]: a rough start is pulled from afar."""
 NARROW = 1.7
@@ -93,12 +93,12 @@ class Solution:
     @cached_property
     def median_information(self) -> float:
         """Median information of the points' depths, 0 without points."""
-        return kernels.median(self.points.information) if len(self.points.ids) else 0.0
+        return medians.median(self.points.information) if len(self.points.ids) else 0.0
 
     @cached_property
     def median_depth(self) -> float:
         """Median distance of the points from the anchor, 1 without points."""
-        return kernels.median(self.points.depths) if len(self.points.ids) else 1.0
+        return medians.median(self.points.depths) if len(self.points.ids) else 1.0
 
     @cached_property
     def noise(self) -> float:
@@ -110,7 +110,7 @@ class Solution:
         """Return the solved points; a depth's information is that given the poses."""
         rows = np.flatnonzero(self.solved)
         given_poses = self.problem._replace(fixed=len(self.problem.mask))
-        information = depth_information(ba.linearise(given_poses, self.state, False))
+        information = depth_information(ba.linearise(given_poses, self.state, False, np.float64))
         x, y, r = (part[rows] for part in self.state.points)
         origins = self.problem.origins
         positions = kernels.place(origins[:, :3, :3].copy(), origins[:, :3, 3].copy(),
@@ -124,7 +124,7 @@ class Solution:
         It contains how well the window's scale is tied to the past, by history and depth
         priors: where points have no parallax it grows, which reprojection errors do not show.
         """
-        system, _ = reduce(ba.linearise(self.problem, self.state, False))
+        system, _ = reduce(ba.linearise(self.problem, self.state, False, np.float64))
         free = len(system) // 6
         blocks = self.noise ** 2 * _inverse(system).reshape(free, 6, free, 6)
         turns = np.zeros((free, 6, 6))
@@ -198,7 +198,7 @@ def _finish(observations: Observations, draft: _Draft, anchor: int) -> Solution:
 
 def _noise(problem: Problem, errors: np.ndarray) -> float:
     """Return the median of errors (F, P), had they not been fitted; 1 without any [px]."""
-    typical, count = kernels.median_where(errors, problem.mask)
+    typical, count = medians.median_where(errors, problem.mask)
     if not count:
         return 1.0
     fitted = 3 * problem.mask.any(axis=0).sum() + 6 * (len(problem.mask) - problem.fixed)
@@ -210,7 +210,7 @@ def _problem(observations: Observations, focal: float, guess: Guess, fixed: int)
     """Return the bundle adjustment of a window, depths drawn to where they are expected."""
     expected = guess.expected_inverse_depths
     strength = np.where(guess.trusted, TRUSTED_DEPTH_PRIOR, DEPTH_PRIOR)
-    spread = np.maximum(expected, LEAST_PRIOR_SPREAD * kernels.median(expected))
+    spread = np.maximum(expected, LEAST_PRIOR_SPREAD * medians.median(expected))
     origins = geometry.make_transform(guess.state.rotations, guess.state.translations)
     return Problem(observations.hosts, origins,
                    np.ascontiguousarray(observations.seen.transpose(1, 2, 0)),
