@@ -22,7 +22,8 @@ from kfvo_ros.optical_flow import Matches
 ENOUGH = 0.4
 """When a smaller share of the points is found the guess was wrong: noise finds every fourth."""
 MOST = 0.7
-"""When a smaller share is found from a right guess, those found tell where the others are."""
+"""When a smaller share is found the guess may be that of a twin, and the next one is tried too; of
+the better one, those found tell where the others are."""
 SHRINKING = 4
 """The whole image is compared in this fraction of its size, where details do not matter ..."""
 LEAST_SHIFT = 4.0
@@ -47,11 +48,11 @@ class TrackSearch:
         """Find points (N, 2) of `last` in `image`, which are (H, W) uint8 of one size."""
         best = Matches(points.copy(), np.zeros(len(points), dtype=bool), np.zeros(points.shape))
         for start in self._guesses(last, image, points):
-            candidates = optical_flow.follow(last, image, points, start)
-            if candidates.found.sum() > best.found.sum():
-                best = candidates
-            if best.found.mean() >= ENOUGH:
-                break
+            best = _better(best, optical_flow.follow(last, image, points, start))
+            if best.found.mean() >= MOST:
+                return best
+        if best.found.mean() < ENOUGH:
+            best = _better(best, optical_flow.follow(last, image, points))
         if ENOUGH <= best.found.mean() < MOST:
             _find_rest(last, image, points, best)
         return best
@@ -65,8 +66,12 @@ class TrackSearch:
             self._bias = self._shift - change.mean(axis=0)
 
     def _guesses(self, last: np.ndarray, image: np.ndarray,
-                 points: np.ndarray) -> Iterator[np.ndarray | None]:
-        """Generate where to start, likeliest first; None is at the points and reaches farther."""
+                 points: np.ndarray) -> Iterator[np.ndarray]:
+        """Generate where to start, likeliest first.
+
+        The whole image tells better than the last motion what changed, as a rule; but the shift of
+        a facade may be that of its windows, or what is near may have moved alone.
+        """
         self._shift = whole_shift(last, image, self._field)
         if self._field is None:
             yield points + self._shift
@@ -75,7 +80,6 @@ class TrackSearch:
             if np.linalg.norm(shift) > LEAST_SHIFT:
                 yield expected + shift
             yield expected
-        yield None
 
 
 def whole_shift(last: np.ndarray, image: np.ndarray, field: MotionField | None) -> np.ndarray:
@@ -95,6 +99,11 @@ def whole_shift(last: np.ndarray, image: np.ndarray, field: MotionField | None) 
         before = cv2.warpPerspective(before, H, size, borderMode=cv2.BORDER_REPLICATE)
     shift, _ = cv2.phaseCorrelate(before, after, cv2.createHanningWindow(size, cv2.CV_32F))
     return SHRINKING * np.array(shift)
+
+
+def _better(a: Matches, b: Matches) -> Matches:
+    """Return those of which more were found."""
+    return b if b.found.sum() > a.found.sum() else a
 
 
 def _find_rest(last: np.ndarray, image: np.ndarray, points: np.ndarray,

@@ -139,7 +139,7 @@ def test_mixed_seeds_defeat_who_searches_where_points_were(tmp_path, monkeypatch
     They do where nothing is expected of the motion; the last one and the shift of the whole
     image, which lead the search, save them.
     """
-    monkeypatch.setattr(track_search.TrackSearch, '_guesses', lambda *_: iter([None]))
+    monkeypatch.setattr(track_search.TrackSearch, '_guesses', lambda *_: iter([]))
     monkeypatch.setattr(track_search, 'MOST', 0.0)
     failed = 0
     for seed in (5, 7):

@@ -94,6 +94,20 @@ def test_a_repeated_texture_is_not_mistaken_for_its_twin():
     assert found.mean() > 0.8 and right[found].mean() > 0.95
 
 
+def test_a_shift_that_is_a_twins_is_not_believed(scene, monkeypatch):
+    """As before a facade: half of the image repeats, and looks the same two windows farther on."""
+    rng = np.random.default_rng(1)
+    window = cv2.GaussianBlur(rng.integers(0, 255, (30, 30), dtype=np.uint8), (0, 0), 1.5)
+    wall = np.hstack([np.tile(window, (8, 10)), cut(scene, 140, 90)])
+    last, image = wall[:, 130:450].copy(), wall[:, 100:420].copy()
+    points = corners(last)
+    points = points[(points[:, 0] > 40.0) & (points[:, 0] < 250.0)]
+    monkeypatch.setattr(track_search, 'whole_shift', lambda *_: np.array([-60.0, 0.0]))
+    after, found, _ = TrackSearch(moved(30, 0)).find_again(last, image, points)
+    right = np.abs(after - points - (30.0, 0.0)).max(axis=1) < 0.5
+    assert found.mean() > 0.8 and right[found].mean() > 0.95
+
+
 def test_a_fast_turn_before_a_tiled_wall_does_not_lead_to_twins():
     """12 deg per frame; right tracks agree with the true motion."""
     room = SyntheticSequence(51, 'mixed')
