@@ -121,7 +121,7 @@ def _add_coupling(J_m: np.ndarray, J: np.ndarray, H_mp: np.ndarray) -> None:
 @compiled
 def linearise(problem: Problem, state: State, with_lens: bool,
               precision: type[np.floating[Any]]) -> NormalEquations:
-    """Return the normal equations at `state`, priors included, what couples in this `precision`.
+    """Return the normal equations at `state`, priors included; H_cp is in this `precision`.
 
     With the lens they have LENS rows more, of what is zero now: by what share points lie farther
     off the axis, by what share times r^2 and r^4, r off it, and where the axis is.

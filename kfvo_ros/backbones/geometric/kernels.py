@@ -219,7 +219,7 @@ def load() -> None:
     rotations, translations, ones = np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3)), np.ones(1)
     points = straighten(np.zeros((2, 2)), np.zeros(ba.LENS))
     ids, seen, mask, hosts, _ = merge(np.zeros(2, dtype=np.int64), points, np.zeros(2),
-                               np.array([1, 2]), 1)
+                                      np.array([1, 2]), 1)
     rays = np.ones((1, 3))
     triangulate(rotations, translations, hosts, rays, seen, mask)
     place(rotations, translations, hosts, rays, ones)

@@ -4,8 +4,8 @@
 
 Each point has three unknowns that nothing but poses couple to others: with the Cholesky factors L
 of their own 3x3 blocks, what couples them is made white, L^-1 H_pc, and its products are what the
-poses' system loses. That takes most of the time, and half of it in numbers of 32 bits: good for a
-step, which is tried before it is believed, but not for what is told of a solved window.
+poses' system loses. They take most of the time, and in numbers of 32 bits half of it: exact enough
+for a step, which is tried before it is believed, but not for what is told of a solved window.
 """
 
 from __future__ import annotations
