@@ -101,12 +101,13 @@ class _Trails:
 def common(a: Tracks, b: Tracks) -> tuple[np.ndarray, np.ndarray]:
     """Return the pixels (M, 2) in a and in b of the tracks that both see."""
     in_a, in_b = shared(a.ids, b.ids)
-    return a.pixels[in_a], b.pixels[in_b]
+    return a.pixels.take(in_a, axis=0), b.pixels.take(in_b, axis=0)
 
 
 def mean_flow(before: np.ndarray, after: np.ndarray) -> float:
     """Return the mean length of the motion from pixels (M, 2) to pixels, 0 of none [px]."""
-    return float(np.hypot(*(after - before).T).mean()) if len(before) else 0.0
+    # Of a few numbers a sum takes a quarter of the time of a mean.
+    return float(np.hypot(*(after - before).T).sum() / len(before)) if len(before) else 0.0
 
 
 class Tracker:
