@@ -206,6 +206,15 @@ def test_turning_is_held_and_its_rotation_right(noise):
                              )[0].status is Status.OK
 
 
+def test_a_frame_at_rest_is_not_held_where_the_window_moved():
+    """There is no parallax to the last keyframe, and enough to those before it."""
+    poses, backbone = moving_poses(8), GeometricBackbone()
+    poses[-1] = poses[-2]
+    estimate = backbone.estimate([window(poses, noise=0.1, backbone=backbone)])[0]
+    assert estimate.signals[GeometricBackbone.signal_names.index('parallax')] < np.log1p(1.0)
+    assert estimate.status is Status.OK
+
+
 def test_a_frame_that_shares_nothing_is_lost_where_it_was():
     backbone = GeometricBackbone()
     hinted = followed(backbone, moving_poses(8), 0.2)

@@ -13,7 +13,7 @@ from kfvo_ros.backbones.geometric.compilation import compiled
 def _gather(values: np.ndarray, first: int, last: int, limit: float) -> int:
     """Bring those of values[first:last] below the limit to the front; return where they end.
 
-    No step depends on a comparison: what a processor cannot foresee takes it three times as long.
+    No step depends on a comparison: a processor loses time where it cannot foresee the next one.
     """
     end = first
     for k in range(first, last):

@@ -4,8 +4,8 @@
 
 Each point has three unknowns that nothing but poses couple to others: with the Cholesky factors L
 of their own 3x3 blocks, what couples them is made white, L^-1 H_pc, and its products are what the
-poses' system loses. They take most of the time, and in numbers of 32 bits half of it: exact enough
-for a step, which is tried before it is believed, but not for what is told of a solved window.
+poses' system loses. Those take most of the time, and less in numbers of 32 bits: exact enough for
+a step, which is tried before it is believed, but not for what is told of a solved window.
 """
 
 from __future__ import annotations
@@ -104,11 +104,11 @@ def _eliminate(normal: NormalEquations, damping: float,
     _whiten(L, pull)
     for row in range(size):
         _whiten(L, normal.H_cp[row])
-    white = normal.H_cp.reshape(size, pull.size)
+    white, flat = normal.H_cp.reshape(size, pull.size), pull.reshape(pull.size)
     add_products(white, -1.0, system)
     for row in range(size):
         system[row, row] += damping * normal.H_cc[row, row] + TINY
-        gradient[row] -= dot(white[row], pull.reshape(pull.size))
+        gradient[row] -= dot(white[row], flat)
     return system, gradient, pull
 
 
