@@ -127,8 +127,8 @@ def test_pacing_is_never_early_and_does_not_drift():
         elapsed_ns = time.monotonic_ns() - began
         assert elapsed_ns >= index * 2_000_000 + late_ns
         if index == 50:
-            time.sleep(0.01)  # a delay is made up for
-    assert elapsed_ns < 99 * 2_000_000 + 20_000_000
+            time.sleep(0.09)  # a delay is made up for
+    assert elapsed_ns < 99 * 2_000_000 + 90_000_000
 
 
 def test_pacing_tells_how_late_it_is():

