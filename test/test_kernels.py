@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 import textwrap
@@ -11,7 +12,7 @@ import textwrap
 import numpy as np
 import pytest
 
-from kfvo_ros.backbones.geometric import kernels
+from kfvo_ros.backbones.geometric import compilation, kernels
 
 
 def test_no_frame_waits_for_the_compiler():
@@ -41,7 +42,7 @@ def test_no_frame_waits_for_the_compiler():
         sys.exit(not any(before.values()) or signatures() != before)
     ''')
     done = subprocess.run([sys.executable, '-c', script], capture_output=True, text=True,
-                          timeout=120)
+                          timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
 
 
@@ -58,3 +59,36 @@ def test_shared_numbers_are_counted(sizes):
     rng = np.random.default_rng(4)
     a, b = (np.sort(rng.choice(40, size, replace=False)) for size in sizes)
     assert kernels.count_shared(a, b) == len(np.intersect1d(a, b))
+
+
+CALLER = """
+from {package}.compilation import compiled
+from {package}.callee import doubled
+
+@compiled
+def run(x):
+    return doubled(x) + 1.0
+"""
+CALLEE = """
+from {package}.compilation import compiled
+
+@compiled
+def doubled(x):
+    return {factor} * x
+"""
+
+
+def test_machine_code_of_a_changed_callee_is_not_used_again(tmp_path):
+    package = tmp_path / 'compiling'
+    package.mkdir()
+    shutil.copy(compilation.__file__, package)
+    (package / 'caller.py').write_text(CALLER.format(package=package.name))
+    answers = []
+    for factor in (2.0, 3.0, 3.0):
+        (package / 'callee.py').write_text(CALLEE.format(package=package.name, factor=factor))
+        done = subprocess.run(
+            [sys.executable, '-c', 'from compiling.caller import run; print(run(1.0), '
+             'sum(run.stats.cache_hits.values()))'],
+            cwd=tmp_path, capture_output=True, text=True, timeout=300)
+        answers.append(done.stdout.split())
+    assert answers == [['3.0', '0'], ['4.0', '0'], ['4.0', '1']], done.stderr
