@@ -14,6 +14,9 @@ MIN_SHARED_POINTS = 8
 """With fewer points in common their depths do not tell the scale."""
 STANDSTILL = 1e-3
 """Keyframes closer to the anchor than this share of the window's extent tell no scale."""
+LEAST_AGREEMENT = 0.98
+"""Nor do keyframes whose known and new places agree less, as a cosine: while a camera stands both
+are noise, and a ratio of noise in every window would carry the scale away."""
 
 
 class ScaleAligner:
@@ -74,9 +77,11 @@ def compare_translations(known: np.ndarray, new: np.ndarray) -> float | None:
 
     `known` (S - 1, 4, 4) and `new` (S, 4, 4) are poses in the anchor; None at standstill.
     """
-    a = np.linalg.norm(known[1:, :3, 3], axis=1)
-    b = np.linalg.norm(new[1:len(known), :3, 3], axis=1)
+    known_places, new_places = known[1:, :3, 3], new[1:len(known), :3, 3]
+    a, b = np.linalg.norm(known_places, axis=1), np.linalg.norm(new_places, axis=1)
     extent = np.linalg.norm(new[:, :3, 3], axis=1).max()
-    if b @ b <= (STANDSTILL * extent) ** 2:
+    agreement = (known_places * new_places).sum()
+    if (b @ b <= (STANDSTILL * extent) ** 2
+            or agreement <= LEAST_AGREEMENT * np.linalg.norm(a) * np.linalg.norm(b)):
         return None
     return float(a @ b / (b @ b))

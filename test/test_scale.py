@@ -86,6 +86,42 @@ def test_a_window_that_does_not_move_at_all_keeps_the_last_scale():
     assert aligner.align(estimate(1.0, translations=0.0), previous()) == pytest.approx(2.5)
 
 
+def slide(positions: np.ndarray, noise: float, rng: np.random.Generator) -> list[float]:
+    """Return the scale of each window of a camera (N, 3) that keeps all frames.
+
+    Every window sees them with noise of its own, as a backbone without points would.
+    """
+    aligner, known, scales = ScaleAligner('translation'), np.zeros((1, 3)), []
+    for newest in range(1, len(positions)):
+        places = positions[max(newest - 7, 0):newest + 1]
+        known = known[-len(places) + 1:]
+        seen = np.tile(np.eye(4), (len(places), 1, 1))
+        seen[1:, :3, 3] = places[1:] - places[0] + noise * rng.normal(size=(len(places) - 1, 3))
+        before = np.tile(np.eye(4), (len(known), 1, 1))
+        before[:, :3, 3] = known - known[0]
+        scales.append(aligner.align(
+            Estimate(seen, lambda: np.zeros((8, 6, 6)), None, np.zeros(0, dtype=np.float32)),
+            Previous(before, np.eye(4), None)))
+        known = known[0] + scales[-1] * seen[:, :3, 3]
+    return scales
+
+
+@pytest.mark.parametrize('noise', [1e-6, 1e-3, 3e-3])
+def test_a_long_rest_carries_no_scale_away(noise):
+    moves = np.concatenate([np.ones(20), np.zeros(100), np.ones(20)])
+    positions = np.cumsum(0.05 * moves[:, None] * [1.0, 0.2, 0.3], axis=0)
+    for seed in range(10):
+        scales = slide(positions, noise, np.random.default_rng(seed))
+        assert 0.6 < scales[-1] / scales[17] < 1.6
+
+
+def test_one_image_again_and_again_keeps_the_last_scale():
+    aligner = ScaleAligner('translation')
+    assert aligner.align(estimate(2.5), previous()) == pytest.approx(2.5)
+    known = Previous(np.tile(np.eye(4), (7, 1, 1)), np.eye(4), None)  # all at the anchor
+    assert aligner.align(estimate(7.0, with_points=False), known) == pytest.approx(2.5)
+
+
 def test_first_window_starts_at_median_depth_one():
     for rule in ('translation', 'depth'):
         first = estimate(1.0)
