@@ -75,7 +75,8 @@ class Update:
 
     ``T_world_camera`` (4, 4) is the estimate at arrival, ``covariance`` (6, 6) its covariance
     in the world, translation first, and ``window_covariance`` the part that arose in this
-    window; ``final`` are the frames whose poses became final, in input order;
+    window; ``final`` are the frames whose poses became final, in input order, to be read at
+    once: of a camera at rest they are let go while their keyframe is still in the window;
     ``points`` of the window in the world, None without;
     ``durations`` [s] of the steps encode, estimate, decide; ``intrinsics`` K (3, 3) [px] where
     the backbone estimates them; ``parts`` [s] of these steps, where it tells them.
@@ -176,8 +177,9 @@ class KeyframeOdometry:
         """
         if estimate is None:
             # The first frame is the world; that of a later start is where the last one was lost,
-            # and as doubtful.
-            self._known = Knowledge(self._newest.T_world_camera, self._newest.covariance,
+            # and as doubtful: nobody saw how far the camera went meanwhile.
+            self._newest.covariance = self._covariance
+            self._known = Knowledge(self._newest.T_world_camera, self._covariance,
                                     memory=self._known.memory)
             self._status = Status.OK if self._newest.index == 0 else Status.LOST
             self._parts = {}
