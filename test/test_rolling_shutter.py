@@ -107,6 +107,20 @@ def test_nothing_is_corrected_without_a_motion_to_tell_from():
         assert np.array_equal(shutter.correct(stamp_ns, later), later.pixels)
 
 
+def test_stamps_closer_than_a_readout_are_not_believed():
+    camera = TurningCamera(0)
+    first, second = (camera.expose(index * FRAME_NS * 1e-9)[0] for index in range(2))
+    ids = np.flatnonzero(inside(first) & inside(second))
+    corrected = []
+    for gap_s in (READOUT, 0.1 * READOUT, 1e-9):
+        shutter = RollingShutter(CAMERA)
+        shutter.correct(1, sure(ids, first[ids]))
+        corrected.append(shutter.correct(1 + round(gap_s * 1e9), sure(ids, second[ids])))
+    assert np.abs(corrected[0] - second[ids]).max() > 1.0
+    assert np.array_equal(corrected[0], corrected[1])
+    assert np.array_equal(corrected[0], corrected[2])
+
+
 def test_a_still_camera_is_not_moved():
     camera, shutter = TurningCamera(0), RollingShutter(CAMERA)
     _, still = camera.expose(0.0)

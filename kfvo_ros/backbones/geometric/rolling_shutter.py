@@ -5,6 +5,9 @@
 A row read dt after the middle one sees its points dt later, so a point is moved back by its
 image velocity times dt. To first order that is the whole effect; left in, it looks like depth and
 translation to a bundle adjustment, and a turning camera is what suffers most.
+
+A frame is read out before the next one is: stamps that are closer than that were given late or
+early by a busy computer, and velocities are those of a whole readout at least.
 """
 
 from __future__ import annotations
@@ -43,7 +46,8 @@ class RollingShutter:
         motion = tracks.pixels[now] - last[1].pixels[before]
         # A point that moved down was read later in its frame, so it had more time to move.
         rows_s = self.camera.readout_s * motion[:, 1:] / self.camera.height
-        measured = motion / ((stamp_ns - last[0]) / NANOSECONDS + rows_s)
+        gap_s = max((stamp_ns - last[0]) / NANOSECONDS, self.camera.readout_s)
+        measured = motion / (gap_s + rows_s)
         size = np.array([self.camera.width, self.camera.height])
         field = self._last_field = motion_field.fit(tracks.pixels[now], measured, size)
         if field is None:
