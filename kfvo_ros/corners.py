@@ -32,7 +32,7 @@ PRECISION = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.05)
 def find_corners(image: np.ndarray, occupied: np.ndarray, count: int) -> np.ndarray:
     """Return up to `count` corners (N, 2) [px] of an image (H, W) away from `occupied` (M, 2)."""
     size = np.array(image.shape[::-1])
-    factor = 2 if image.size > LARGE else 1
+    factor = 2 if image.size > LARGE and size.min() > 1 else 1
     small = cv2.resize(image, tuple(int(side) for side in size // factor),
                        interpolation=cv2.INTER_AREA)
     # A pixel of the small image is centred between those that it covers.

@@ -59,7 +59,7 @@ class Tracks:
         return len(self.ids)
 
     def select(self, mask: np.ndarray) -> Tracks:
-        """Return the tracks under a boolean mask or at sorted indices."""
+        """Return the tracks under a boolean mask (N,)."""
         return Tracks(self.ids[mask], self.pixels[mask], self.doubts[mask])
 
 

@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from odometry_scenes import (
@@ -17,7 +19,7 @@ from odometry_scenes import (
     window,
 )
 
-from kfvo_ros import geometry
+from kfvo_ros import geometry, knowledge
 from kfvo_ros.backbones.base import Estimate, Previous, Status, Window
 from kfvo_ros.backbones.geometric.backbone import GeometricBackbone
 from kfvo_ros.errors import KfvoError
@@ -213,6 +215,21 @@ def test_a_frame_at_rest_is_not_held_where_the_window_moved():
     estimate = backbone.estimate([window(poses, noise=0.1, backbone=backbone)])[0]
     assert estimate.signals[GeometricBackbone.signal_names.index('parallax')] < np.log1p(1.0)
     assert estimate.status is Status.OK
+
+
+@pytest.mark.parametrize('unit', [1e-4, 1e3])
+def test_a_window_is_the_same_in_any_unit(unit):
+    """A camera that starts far above a field lands in it; another starts at a wall."""
+    backbone = GeometricBackbone()
+    window = followed(backbone, moving_poses(8), 0.1)
+    usual = backbone.estimate([window])[0]
+    hint = window.previous
+    elsewhere = replace(window, previous=Previous(
+        knowledge.scaled(hint.T_anchor_frame, unit), knowledge.scaled(hint.T_anchor_latest, unit),
+        knowledge.moved(hint.points, np.eye(4), unit), hint.memory, unit))
+    other = backbone.estimate([elsewhere])[0]
+    np.testing.assert_allclose(knowledge.scaled(other.T_anchor_frame, 1.0 / unit),
+                               usual.T_anchor_frame, rtol=0.0, atol=1e-5)
 
 
 def test_a_frame_that_shares_nothing_is_lost_where_it_was():

@@ -56,7 +56,8 @@ class Encoded:
 class Points:
     """Scene points by track id: ``positions`` (P, 3) in the anchor, in the estimate's unit.
 
-    ``information`` (P,) is the inverse variance of the logarithm of a point's depth.
+    ``information`` (P,) is the inverse variance of the logarithm of a point's depth, for tracks
+    that are off by one pixel.
     """
 
     ids: np.ndarray

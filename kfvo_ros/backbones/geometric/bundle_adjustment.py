@@ -25,6 +25,7 @@ MAX_REJECTIONS = 5
 MIN_IMPROVEMENT = 1e-3
 """A step that lowers the cost by a smaller share is the last one."""
 LEAST_INVERSE_DEPTH = 1e-4
+"""Farther points are as far as that: ten thousand times as far as the first scene."""
 POSE, LENS, POINT = 6, 5, 3
 """So many numbers each: what a residual depends on, in the order of its derivatives."""
 WIDE_ANGLE = 2.0

@@ -14,10 +14,10 @@ import poselib
 from kfvo_ros import geometry, track_ids
 from kfvo_ros.backbones.base import Previous
 from kfvo_ros.backbones.geometric import kernels, medians
+from kfvo_ros.backbones.geometric.bundle_adjustment import LEAST_INVERSE_DEPTH
 from kfvo_ros.backbones.geometric.memory import History, memory_of
 from kfvo_ros.backbones.geometric.observations import Observations
 from kfvo_ros.backbones.geometric.problem import State
-from kfvo_ros.backbones.geometric.reprojection import MIN_DEPTH
 
 MIN_PAIR_TRACKS = 12
 """Two frames with fewer common tracks cannot start a window."""
@@ -29,11 +29,12 @@ MIN_RESECTION_POINTS, ENOUGH_POINTS = 6, 100
 """Of more than so many points only every second, or third, is resected from."""
 NEIGHBOURS = 5
 """So many known points around it tell where a new one is expected."""
-NEAREST, FARTHEST = 0.02, 50.0
-"""Triangulated inverse depths are believed within this range of the scene's median."""
+LEAST_SHARE, LARGEST_SHARE = 0.02, 50.0
+"""Triangulated inverse depths are believed within these shares of the scene's median."""
 MAX_SPREAD = 0.7
 """... and when one pixel moves them by less than this share of the median."""
-LEAST_INVERSE_DEPTH = 1e-4
+LEAST_COSINE = 1e-3
+"""Points at a steeper angle to the optical axis are not in front of a camera."""
 
 RELATIVE_POSE = {'max_epipolar_error': 1.0, 'max_iterations': 500, 'min_iterations': 20}
 ABSOLUTE_POSE = {'max_reproj_error': 3.0, 'max_iterations': 200, 'min_iterations': 5}
@@ -221,7 +222,8 @@ class Initialiser:
         believed = triangulated > LEAST_INVERSE_DEPTH
         reference = triangulated[believed] if unknown.all() else inverse_depths[~unknown]
         median = medians.median(reference) if len(reference) else 1.0
-        believed &= (triangulated > NEAREST * median) & (triangulated < FARTHEST * median)
+        believed &= ((triangulated > LEAST_SHARE * median)
+                     & (triangulated < LARGEST_SHARE * median))
         believed &= self.focal * np.sqrt(weights) * MAX_SPREAD * median > 1.0
         filled = np.where(unknown, np.where(believed, triangulated, median), inverse_depths)
         return State(*_rotations_and_translations(T_anchor_frame),
@@ -252,7 +254,7 @@ def known_inverse_depths(observations: Observations, T_anchor_frame: np.ndarray,
     hosts = observations.hosts[rows]
     towards = previous.points.positions[known] - T_anchor_frame[hosts, :3, 3]
     depths = (T_anchor_frame[hosts, :3, 2] * towards).sum(axis=1)
-    in_front = depths > MIN_DEPTH
+    in_front = depths > LEAST_COSINE * np.linalg.norm(towards, axis=1)
     inverse_depths[rows[in_front]] = 1.0 / depths[in_front]
     return inverse_depths
 

@@ -88,14 +88,6 @@ def _rotate_back(R, v0, v1, v2):
 
 
 @compiled
-def _into_frame(rotations, translations, h, j, ray, r):
-    """Return r times a point of depth 1 / r in frame j; its ray is turned into the anchor."""
-    return _rotate_back(rotations[j], ray[0] + r * (translations[h, 0] - translations[j, 0]),
-                        ray[1] + r * (translations[h, 1] - translations[j, 1]),
-                        ray[2] + r * (translations[h, 2] - translations[j, 2]))
-
-
-@compiled
 def triangulate(rotations, translations, hosts, rays, seen, mask):
     """Return closed-form inverse depths (P,) and their parallax weights (P,).
 
@@ -111,7 +103,7 @@ def triangulate(rotations, translations, hosts, rays, seen, mask):
         for j in range(frames):
             if not mask[k, j] or j == h:
                 continue
-            a = _into_frame(rotations, translations, h, j, ray, 0.0)
+            a = _rotate_back(rotations[j], ray[0], ray[1], ray[2])
             c = _rotate_back(rotations[j], translations[h, 0] - translations[j, 0],
                              translations[h, 1] - translations[j, 1],
                              translations[h, 2] - translations[j, 2])

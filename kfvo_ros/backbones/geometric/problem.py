@@ -65,7 +65,8 @@ class NormalEquations(NamedTuple):
 
     With C = 6 (F - fixed), ``H_cc`` (C, C) and ``g_c`` (C,) belong to the poses (rotation, then
     translation, of each free frame), ``H_pp`` (6, P), lower triangles by rows, and ``g_p``
-    (3, P) to the points, ``H_cp`` (C, 3, P) couples them.
+    (3, P) to the points, ``H_cp`` (C, 3, P) couples them. What is asked of the lens too adds its
+    rows to C.
     """
 
     H_cc: np.ndarray

@@ -43,8 +43,9 @@ SUSPICIOUS_SHARE = 0.5
 """When fewer of the newest frame's tracks fit, its first place may have been wrong."""
 WELL_KNOWN = 0.1
 """A depth whose standard deviation is no larger a share of it is worth to be held on to."""
-MIN_PIVOT_RATIO = 1e-6
-"""A system whose Cholesky factor has pivots further apart leaves directions undetermined."""
+LEAST_INFORMATION = 1e-12
+"""So much is known of every direction, as a share of the best known: where it is all, the
+covariance is large."""
 LEAST_NOISE = 0.1
 """Tracks are never believed to be better than this [px]."""
 LEAST_FREEDOM = 0.25
@@ -219,11 +220,6 @@ def _problem(observations: Observations, focal: float, guess: Guess, fixed: int)
 
 
 def _inverse(system: np.ndarray) -> np.ndarray:
-    """Return the inverse of a symmetric system, 0 in directions that nothing determines."""
-    try:
-        pivots = np.linalg.cholesky(system).diagonal()
-    except np.linalg.LinAlgError:
-        return np.linalg.pinv(system, hermitian=True)
-    if pivots.min() < MIN_PIVOT_RATIO * pivots.max():
-        return np.linalg.pinv(system, hermitian=True)
-    return np.linalg.inv(system)
+    """Return the inverse of a symmetric system, large in directions that nothing determines."""
+    least = LEAST_INFORMATION * system.diagonal().max()
+    return np.linalg.inv(system + least * np.eye(len(system)))
