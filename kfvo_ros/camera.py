@@ -14,6 +14,7 @@ import numpy as np
 import yaml
 
 from kfvo_ros.errors import KfvoError, reason_of
+from kfvo_ros.yaml_file import read_yaml
 
 DISTORTION_SIZES = {'none': (0,), 'plumb_bob': (4, 5), 'rational_polynomial': (8,),
                     'equidistant': (4,)}
@@ -69,9 +70,12 @@ class Camera:
         if len(coefficients) not in DISTORTION_SIZES[model]:
             raise KfvoError(f'{model} takes {DISTORTION_SIZES[model]} distortion coefficients, '
                             f'{len(coefficients)} came')
-        numbers = (self.fx, self.fy, self.cx, self.cy, *coefficients)
-        if not np.isfinite(numbers).all() or min(self.fx, self.fy) <= 0 \
-                or min(self.width, self.height) <= 0:
+        numbers = {'fx': self.fx, 'fy': self.fy, 'cx': self.cx, 'cy': self.cy} | {
+            f'distortion[{index}]': value for index, value in enumerate(coefficients)}
+        odd = [f'{name}={value}' for name, value in numbers.items() if not math.isfinite(value)]
+        if odd:
+            raise KfvoError(f'expected finite numbers, came {" ".join(odd)}; is it calibrated?')
+        if min(self.width, self.height, self.fx, self.fy) <= 0:
             raise KfvoError(f'expected positive sizes and focal lengths, came {self.width}x'
                             f'{self.height} fx={self.fx} fy={self.fy}; is it calibrated?')
         if not 0.0 <= self.readout_s < MAX_READOUT:
@@ -204,10 +208,7 @@ def read_camera_info(path: Path) -> Camera:
     An extra key ``readout_s`` says how long a rolling shutter takes from first to last row [s].
     Raises KfvoError naming the file and the key that is missing or wrong.
     """
-    try:
-        document = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError) as error:
-        raise KfvoError(f'cannot read the calibration {path}: {reason_of(error)}') from error
+    document = read_yaml(path, 'the calibration ')
     try:
         fx, _, cx, _, fy, cy = _matrix(document, 'camera_matrix', 9)[:6]
         return Camera(int(document['image_width']), int(document['image_height']), fx, fy, cx,

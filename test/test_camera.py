@@ -236,14 +236,23 @@ def test_a_calibration_is_read(tmp_path):
     ('camera_matrix', 'camera_matrices', "KeyError\\('camera_matrix'\\)"),
     ('0, 0, 1]}\ndist', '0, 0]}\ndist', 'camera_matrix holds 8 numbers, expected 9'),
     ('[517.3, ', '[0.0, ', 'is it calibrated'),
-    ('517.3', 'nan', 'is it calibrated|could not convert'),
+    ('517.3', 'nan', 'expected finite numbers, came fx=nan; is it calibrated'),
+    ('318.6', '.inf', 'expected finite numbers, came cx=inf; is it calibrated'),
+    ('-0.95', '.nan', r'expected finite numbers, came distortion\[1\]=nan; is it calibrated'),
     ('plumb_bob', 'wobbly', "unknown distortion model 'wobbly'"),
     ('1.16', '1.16, 1, 2', 'distortion coefficients, 7 came'),
     ('image_width: 640', 'image_width: 640\nreadout_s: 30', 'readout_s=30.0'),
     ('distortion_coefficients', 'd', "KeyError\\('distortion_coefficients'\\)"),
     ('{rows: 1, cols: 5, data: [0.26,', '[[0.26,', 'cannot read the calibration'),
     ('image_width: 640', '!!python/object/apply:os.getcwd []', 'cannot read the calibration'),
-    ('image_width: 640', 'image_width: ' + '[' * 5000, 'cannot read the calibration')])
+    ('image_width: 640', 'image_width: ' + '[' * 5000, 'cannot read the calibration'),
+    ('640', '2001-13-45', 'cannot read the calibration .*month'),
+    ('640', '!!int foo', "cannot read the calibration .*'foo'"),
+    ('640', '!!float x', "cannot read the calibration .*'x'"),
+    ('640', '0x_', 'cannot read the calibration .*base 16'),
+    ('640', '!!bool x', 'cannot read the calibration'),
+    ('640', '!!int ""', 'cannot read the calibration'),
+    ('640', '!!timestamp x', 'cannot read the calibration')])
 def test_a_bad_calibration_is_named(tmp_path, old, new, problem):
     assert old in CALIBRATION
     path = tmp_path / 'camera_info.yaml'

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -142,10 +143,13 @@ def damage(path: Path, how: str) -> None:
         save_file(tensors, path, {KEY: '{'})
     elif how == 'later version':
         save_file(tensors, path, {KEY: json.dumps({'format_version': 2})})
-    elif how == 'impossible rail':
-        with safe_open(path, 'np') as file:
-            words = json.loads(file.metadata()[KEY])
-        save_file(tensors, path, {KEY: json.dumps(words | {'rail': {'max_gap': 'wide'}})})
+    elif how == 'deep json':
+        save_file(tensors, path, {KEY: '[' * 100_000})
+    elif how == 'bfloat16':
+        text = json.dumps({
+            '__metadata__': {KEY: json.dumps(head)},
+            'mean': {'dtype': 'BF16', 'shape': [1], 'data_offsets': [0, 2]}}).encode()
+        path.write_bytes(len(text).to_bytes(8, 'little') + text + bytes(2))
     elif how == 'not finite':
         replace(good, actor=replace(good.actor, mean=np.full(SIZE, np.nan))).write(path)
     elif how == 'no spread':
@@ -156,17 +160,52 @@ def damage(path: Path, how: str) -> None:
         replace(good, actor=replace(good.actor, layers=())).write(path)
 
 
+def refusal_of(path: Path) -> str:
+    """Return the one line with which a file is refused."""
+    with pytest.raises(KfvoError) as refusal:
+        read_policy(path)
+    line = str(refusal.value)
+    assert str(path) in line and '\n' not in line
+    assert 'expected a policy that kfvo_train wrote' in line
+    return line
+
+
 @pytest.mark.parametrize('how', [
-    'cut', 'text', 'other tensors', 'half a head', 'no json', 'later version', 'not finite',
-    'impossible rail',
-    'no spread', 'wrong size', 'no layers'])
+    'cut', 'text', 'other tensors', 'half a head', 'no json', 'deep json', 'bfloat16',
+    'later version', 'not finite', 'no spread', 'wrong size', 'no layers'])
 def test_a_bad_file_is_one_clear_line(how, tmp_path: Path):
     path = tmp_path / 'policy.safetensors'
     damage(path, how)
-    with pytest.raises(KfvoError) as refusal:
-        read_policy(path)
-    assert str(path) in str(refusal.value) and '\n' not in str(refusal.value)
-    assert 'expected a policy that kfvo_train wrote' in str(refusal.value)
+    refusal_of(path)
+
+
+@pytest.mark.parametrize(('part', 'change', 'problem'), [
+    ('rail', {'max_gap': 'wide'}, "'wide'|not supported between"),
+    ('rail', {'max_gap': 2.5}, 'max_gap: expected a whole number, came 2.5'),
+    ('setting', {'backbone': 5}, 'backbone: expected a word, came 5'),
+    ('setting', {'scale_rule': None}, 'scale_rule: expected a word, came None'),
+    ('setting', {'window_size': '8'}, "window_size: expected a whole number, came '8'"),
+    ('setting', {'window_size': True}, 'window_size: expected a whole number, came True'),
+    ('setting', {'observation': [['far', float('inf')]]}, 'expected a whole number, came inf'),
+    ('setting', {'observation': [['far', '99']]}, "expected a whole number, came '99'"),
+    ('setting', {'observation': [[5, 99]]}, 'observation: expected a word, came 5'),
+    (None, {'training': [1]}, r'training: expected a mapping, came \[1\]')])
+def test_what_a_head_tells_is_of_its_kind(part, change, problem, tmp_path: Path):
+    path = tmp_path / 'policy.safetensors'
+    PolicyFile(random_actor(SIZE), Rail(), SETTING).write(path)
+    with safe_open(path, 'np') as file:
+        head = json.loads(file.metadata()[KEY])
+    (head if part is None else head[part]).update(change)
+    save_file(load_file(path), path, {KEY: json.dumps(head)})
+    assert re.search(problem, refusal_of(path))
+
+
+def test_a_network_without_an_observation_is_refused(tmp_path: Path):
+    path = tmp_path / 'policy.safetensors'
+    layer = Layer(np.zeros((2, 0), np.float32), np.zeros(2, np.float32))
+    PolicyFile(Actor(np.zeros(0), np.ones(0), (layer,)), Rail(),
+               replace(SETTING, observation=())).write(path)
+    assert 'from 0 numbers' in refusal_of(path)
 
 
 def test_missing_files_and_folders_are_named(tmp_path: Path):

@@ -68,17 +68,16 @@ def read_policy(path: Path) -> PolicyFile:
     try:
         with safe_open(path, 'np') as file:
             head = (file.metadata() or {}).get(KEY)
+            if head is None:
+                raise KfvoError(f'{path} is no policy: {EXPECTED}, other tensors came')
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        return _policy(json.loads(head), tensors)
     except (OSError, SafetensorError) as error:
         raise KfvoError(f'cannot read the policy {path}: {EXPECTED}; {reason_of(error)}'
                         ) from error
-    if head is None:
-        raise KfvoError(f'{path} is no policy: {EXPECTED}, other tensors came')
-    try:
-        policy = _policy(json.loads(head), tensors)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise KfvoError(f'{path}: {EXPECTED}; {type(error).__name__}: {error}') from error
-    return policy
+    except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
+        raise KfvoError(f'{path}: {EXPECTED}; {type(error).__name__}: {reason_of(error)}'
+                        ) from error
 
 
 def _policy(head: dict[str, Any], tensors: dict[str, np.ndarray]) -> PolicyFile:
@@ -86,8 +85,16 @@ def _policy(head: dict[str, Any], tensors: dict[str, np.ndarray]) -> PolicyFile:
     if head['format_version'] != FORMAT_VERSION:
         raise ValueError(f'format version {FORMAT_VERSION} is known, the file is of '
                          f'{head["format_version"]}')
-    setting = head['setting']
-    observation = tuple((str(name), int(size)) for name, size in setting.pop('observation'))
+    setting, rail, training = head['setting'], Rail(**head['rail']), head['training']
+    observation = tuple((name, size) for name, size in setting.pop('observation'))
+    _expect(str, 'a word', backbone=setting['backbone'], scale_rule=setting['scale_rule'])
+    for name, size in observation:
+        _expect(str, 'a word', observation=name)
+        _expect(int, 'a whole number', observation=size)
+    _expect(int, 'a whole number', window_size=setting['window_size'])
+    if rail.max_gap is not None:
+        _expect(int, 'a whole number', max_gap=rail.max_gap)
+    _expect(dict, 'a mapping', training=training)
     layers: list[Layer] = []
     while f'layers.{len(layers)}.weight' in tensors:
         prefix = f'layers.{len(layers)}'
@@ -95,8 +102,14 @@ def _policy(head: dict[str, Any], tensors: dict[str, np.ndarray]) -> PolicyFile:
     actor = Actor(tensors['mean'].astype(np.float64), tensors['std'].astype(np.float64),
                   tuple(layers))
     _check(actor, sum(size for _, size in observation))
-    return PolicyFile(actor, Rail(**head['rail']), Setting(**setting, observation=observation),
-                      head['training'])
+    return PolicyFile(actor, rail, Setting(**setting, observation=observation), training)
+
+
+def _expect(kind: type, wanted: str, **values: Any) -> None:
+    """Raise TypeError for a value that is not of this very kind: True is no whole number."""
+    for name, value in values.items():
+        if type(value) is not kind:
+            raise TypeError(f'{name}: expected {wanted}, came {value!r}')
 
 
 def _check(actor: Actor, size: int) -> None:
@@ -108,6 +121,7 @@ def _check(actor: Actor, size: int) -> None:
         raise ValueError('finite float32 numbers and a positive std are needed')
     sizes = [size, *(len(layer.bias) for layer in actor.layers)]
     shapes = [layer.weight.shape for layer in actor.layers]
-    if not shapes or shapes != list(zip(sizes[1:], sizes)) or sizes[-1] != len((DROP, KEEP)) \
+    if size < 1 or not shapes or shapes != list(zip(sizes[1:], sizes)) \
+            or sizes[-1] != len((DROP, KEEP)) \
             or actor.mean.shape != (size,) or actor.std.shape != (size,):
         raise ValueError(f'layers of {shapes} do not lead from {size} numbers to 2')

@@ -7,6 +7,7 @@ from __future__ import annotations
 import gc
 import hashlib
 import json
+import os
 from collections import OrderedDict
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -14,12 +15,14 @@ from typing import Any
 
 from kfvo_ros import __version__, assembly
 from kfvo_ros.backbones.base import Backbone
+from kfvo_ros.camera import read_camera_info
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.learning.augmentation import Augmentation, Variant
 from kfvo_ros.learning.drive_file import read_drive, write_drive
 from kfvo_ros.learning.drives import Drive, record
 from kfvo_ros.options import SequenceOptions
 from kfvo_ros.sequences.base import Sequence
+from kfvo_ros.sequences.calibration import CALIBRATION_FILE
 
 LEAST_FRAMES = 20
 """A shorter drive is over before much was decided."""
@@ -40,7 +43,11 @@ class Archive:
     about: dict[str, Any] = field(default_factory=dict)
     folder: Path | None = None
     live: bool = False
-    _held: OrderedDict[str, Drive] = field(default_factory=OrderedDict)
+    _held: OrderedDict[tuple[str, Augmentation | None, int], Drive] = field(
+        default_factory=OrderedDict)
+
+    def __post_init__(self) -> None:
+        gc.unfreeze()  # What froze along with an earlier archive's drives may be garbage by now.
 
     def whole(self, text: str) -> Drive:
         """Return the sequence as it is; raises KfvoError where it cannot be learned from."""
@@ -53,20 +60,26 @@ class Archive:
     def _drive(self, text: str, augmentation: Augmentation | None, number: int) -> Drive:
         if self.live:
             return self._record(text, augmentation, number)
-        key = self._key(text, augmentation, number)
-        if key not in self._held:
-            path = self.folder / f'{key}.safetensors' if self.folder is not None else None
-            drive = read_drive(path) if path is not None else None
-            if drive is None:
-                drive = self._record(text, augmentation, number)
-                if path is not None:
-                    write_drive(path, drive)
-            self._held[key] = drive
-            gc.freeze()  # Thousands of objects, none in a cycle: not to be searched for garbage.
+        asked = (text, augmentation, number)
+        if asked not in self._held:
+            self._held[asked] = self._recall(*asked)
             if len(self._held) > MOST_HELD:
                 self._held.popitem(last=False)
-        self._held.move_to_end(key)
-        return self._held[key]
+            gc.collect()  # What is garbage already would stay for ever.
+            gc.freeze()  # Thousands of objects, none in a cycle: not to be searched for garbage.
+        self._held.move_to_end(asked)
+        return self._held[asked]
+
+    def _recall(self, text: str, augmentation: Augmentation | None, number: int) -> Drive:
+        """Return the drive from the folder; record it where it is not there."""
+        if self.folder is None:
+            return self._record(text, augmentation, number)
+        path = self.folder / f'{self._key(text, augmentation, number)}.safetensors'
+        drive = read_drive(path)
+        if drive is None:
+            drive = self._record(text, augmentation, number)
+            write_drive(path, drive)
+        return drive
 
     def _record(self, text: str, augmentation: Augmentation | None, number: int) -> Drive:
         sequence: Sequence = assembly.make_sequence(text, self.reading)
@@ -82,10 +95,24 @@ class Archive:
 
     def _key(self, text: str, augmentation: Augmentation | None, number: int) -> str:
         """Return a name for the drive that no other has, in this version."""
-        path = Path(text).expanduser()
+        path, camera = Path(text).expanduser(), self.reading.camera
+        reading = asdict(self.reading) | {
+            'camera': camera and asdict(read_camera_info(Path(camera)))}
         what = {'version': __version__, 'text': str(path.resolve()) if path.exists() else text,
-                'changed_ns': path.stat().st_mtime_ns if path.exists() else 0,
-                'reading': asdict(self.reading), 'number': number, 'about': self.about,
+                'changed_ns': _files_of(path) if path.exists() else 0,
+                'reading': reading, 'number': number, 'about': self.about,
                 'augmentation': augmentation and asdict(augmentation)}
         digest = hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
         return f'{path.name[:32].replace(":", "-")}-{digest[:16]}'
+
+
+def _files_of(path: Path) -> list[tuple[str, int, int]]:
+    """Return name, size and time of change [ns] of all files that a sequence may be read from.
+
+    Beside its own path that is a calibration, and the true poses of KITTI.
+    """
+    path = Path(os.path.abspath(path))
+    files = (path, *path.rglob('*'), path.parent / CALIBRATION_FILE,
+             path.parent.parent / 'poses' / f'{path.name}.txt')
+    return sorted((os.path.relpath(file, path), file.stat().st_size, file.stat().st_mtime_ns)
+                  for file in files if file.is_file())

@@ -7,6 +7,7 @@ from __future__ import annotations
 import json
 from dataclasses import asdict
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from safetensors import SafetensorError, safe_open
@@ -14,6 +15,7 @@ from safetensors.numpy import save_file
 
 from kfvo_ros.atomic import replaced
 from kfvo_ros.backbones.base import Encoded
+from kfvo_ros.backbones.geometric.backbone import GeometricBackbone
 from kfvo_ros.backbones.geometric.observations import View
 from kfvo_ros.camera import Camera
 from kfvo_ros.errors import KfvoError, reason_of
@@ -26,8 +28,10 @@ KEY = 'kfvo_drive'
 
 def write_drive(path: Path, drive: Drive) -> None:
     """Write a drive; whoever reads meanwhile sees all of it or nothing. Raises KfvoError."""
-    encoded = [each for each in drive.encoded if each is not None]
-    tracks = [each.tracks or Tracks() for each in encoded]
+    # This backbone asks for a camera, encodes every frame of a drive and offers tracks.
+    camera = cast(Camera, drive.frames[0].camera)
+    encoded = cast('tuple[Encoded, ...]', drive.encoded)
+    tracks = [cast(Tracks, each.tracks) for each in encoded]
     arrays = {
         'stamps_ns': np.array([frame.stamp_ns for frame in drive.frames], dtype=np.int64),
         'T_truth_camera': drive.T_truth_camera,
@@ -39,8 +43,7 @@ def write_drive(path: Path, drive: Drive) -> None:
         'doubts': np.concatenate([each.doubts for each in tracks]),
         'points': np.concatenate([_points(each.payload, all_of_it)
                                   for each, all_of_it in zip(encoded, tracks, strict=True)])}
-    camera = drive.frames[0].camera
-    head = {'name': drive.name, 'camera': None if camera is None else asdict(camera)}
+    head = {'name': drive.name, 'camera': asdict(camera)}
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with replaced(path) as draft:
@@ -56,6 +59,7 @@ def read_drive(path: Path) -> Drive | None:
         with safe_open(path, 'np') as file:
             head = json.loads((file.metadata() or {})[KEY])
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        _check(arrays)
         camera = Camera(**head['camera'] | {'distortion': tuple(head['camera']['distortion'])})
         rows = np.cumsum(arrays['counts'])[:-1]
         parts = zip(*(np.split(arrays[name], rows)
@@ -65,8 +69,22 @@ def read_drive(path: Path) -> Drive | None:
         return Drive(head['name'],
                      tuple(Frame(each.stamp_ns, NO_IMAGE, camera) for each in encoded),
                      tuple(encoded), arrays['T_truth_camera'])
-    except (OSError, SafetensorError, KeyError, TypeError, ValueError):
+    except Exception:  # of what is no drive whatever comes, and then it is recorded anew
         return None
+
+
+def _check(arrays: dict[str, np.ndarray]) -> None:
+    """Raise ValueError unless the arrays are of as many frames and tracks, and are numbers."""
+    frames, tracks = len(arrays['stamps_ns']), int(arrays['counts'].sum())
+    shapes = {'stamps_ns': (frames,), 'T_truth_camera': (frames, 4, 4),
+              'descriptors': (frames, GeometricBackbone.descriptor_size), 'indices': (frames,),
+              'counts': (frames,), 'ids': (tracks,), 'pixels': (tracks, 2), 'doubts': (tracks,),
+              'points': (tracks, 2)}
+    if {name: array.shape for name, array in arrays.items()} != shapes:
+        raise ValueError('other shapes')
+    # A point is NaN where its pixel has no ray.
+    if not all(np.isfinite(array).all() for name, array in arrays.items() if name != 'points'):
+        raise ValueError('not finite')
 
 
 def _points(view: View, tracks: Tracks) -> np.ndarray:

@@ -34,6 +34,12 @@ class Drive:
     def __len__(self) -> int:
         return len(self.frames)
 
+    @property
+    def truth(self) -> Trajectory:
+        """Return where the camera truly was when each frame was taken."""
+        stamps_ns = np.array([frame.stamp_ns for frame in self.frames], dtype=np.int64)
+        return Trajectory(stamps_ns, self.T_truth_camera)
+
     def since(self, start: int) -> Drive:
         """Return the drive without its first frames."""
         return Drive(self.name, self.frames[start:], self.encoded[start:],

@@ -7,8 +7,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-import numpy as np
-
 from kfvo_ros import assembly, metrics
 from kfvo_ros.backbones.base import Backbone
 from kfvo_ros.keyframes.base import KeyframePolicy
@@ -19,9 +17,8 @@ from kfvo_ros.learning.drives import Drive
 from kfvo_ros.learning.railed import RailAlone, Random
 from kfvo_ros.learning.recipe import Recipe
 from kfvo_ros.learning.references import references
-from kfvo_ros.learning.validation import LEAST_PERCENT, Validation
+from kfvo_ros.learning.validation import Validation, ate_percent
 from kfvo_ros.options import OdometryOptions
-from kfvo_ros.trajectory import Trajectory
 
 DICE = (0, 1, 2)
 """Seeds of the random policy."""
@@ -60,8 +57,5 @@ class Examination:
             yield from self.outcomes(RailAlone.name, None, RailAlone(rail))
         for trivial in (metrics.constant_position, metrics.straight_line):
             for name, drive in self.drives.items():
-                stamps_ns = np.array([frame.stamp_ns for frame in drive.frames], dtype=np.int64)
-                error = metrics.absolute_trajectory_error(
-                    trivial(stamps_ns), Trajectory(stamps_ns, drive.T_truth_camera))
-                percent = max(100.0 * error.rmse / error.path_length, LEAST_PERCENT)
+                percent = ate_percent(trivial(drive.truth.stamps_ns), drive)
                 yield Outcome(trivial.__name__, None, name, percent, 0.0)

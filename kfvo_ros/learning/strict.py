@@ -75,7 +75,7 @@ def _number(value: Any) -> Any:
     """Return a float where one is meant: YAML 1.1 takes 1 for an integer, 3e-4 for a word."""
     try:
         return float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return value
 
 

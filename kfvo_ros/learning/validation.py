@@ -11,6 +11,7 @@ import numpy as np
 
 from kfvo_ros import metrics
 from kfvo_ros.backbones.base import Backbone
+from kfvo_ros.errors import KfvoError
 from kfvo_ros.keyframes.base import KeyframePolicy
 from kfvo_ros.keyframes.learned import Setting
 from kfvo_ros.learning.drives import Drive
@@ -33,9 +34,18 @@ class Score:
     kept: float
 
 
+def ate_percent(estimate: Trajectory, drive: Drive) -> float:
+    """Return the ATE [% of the path]; raises KfvoError for a drive that never moves."""
+    try:
+        error = metrics.absolute_trajectory_error(estimate, drive.truth)
+    except KfvoError as problem:
+        raise KfvoError(f'{drive.name}: {problem}') from problem
+    return max(100.0 * error.rmse / error.path_length, LEAST_PERCENT)
+
+
 @dataclass(frozen=True)
 class Validation:
-    """Runs policies over ``drives`` as `KeyframeOdometry` runs them in use."""
+    """Runs policies over ``drives``: frames whose truth is known, as an odometry would."""
 
     drives: Sequence[Drive]
     backbone: Backbone
@@ -51,10 +61,7 @@ class Validation:
         for drive in self.drives:
             before_each()
             estimate, keyframes = self._run(policy, drive)
-            stamps_ns = np.array([frame.stamp_ns for frame in drive.frames], dtype=np.int64)
-            error = metrics.absolute_trajectory_error(
-                estimate, Trajectory(stamps_ns, drive.T_truth_camera))
-            percents.append(max(100.0 * error.rmse / error.path_length, LEAST_PERCENT))
+            percents.append(ate_percent(estimate, drive))
             kept += keyframes
         return Score(float(np.exp(np.mean(np.log(percents)))),
                      kept / sum(len(drive) for drive in self.drives))

@@ -12,17 +12,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from kfvo_ros import geometry
 from kfvo_ros.camera import Camera
-from kfvo_ros.errors import KfvoError, reason_of
+from kfvo_ros.errors import KfvoError
 from kfvo_ros.sequences.base import GroundTruth
 from kfvo_ros.sequences.calibration import Calibration, rigid_transform
 from kfvo_ros.sequences.image_list import ImageListSequence
 from kfvo_ros.sequences.kind import Kind, Options
 from kfvo_ros.text_rows import parse_pose, read_rows
 from kfvo_ros.trajectory import Trajectory
+from kfvo_ros.yaml_file import read_yaml
 
 
 def open_euroc(path: Path, options: Options) -> ImageListSequence:
@@ -50,12 +50,7 @@ def _parse_image(line: str) -> tuple[int, str]:
 
 
 def _read_sensor(path: Path) -> dict[str, Any]:
-    """Read a sensor.yaml, whose first line ``%YAML:1.0`` is OpenCV's and not YAML."""
-    try:
-        lines = path.read_text(encoding='utf-8').splitlines()
-        sensor = yaml.safe_load('\n'.join(line for line in lines if not line.startswith('%')))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise KfvoError(f'cannot read {path}: {reason_of(error)}') from error
+    sensor = read_yaml(path)
     if not isinstance(sensor, dict):
         raise KfvoError(f'{path}: expected the keys of an EuRoC sensor, found {sensor!r:.80}')
     return sensor
@@ -70,7 +65,7 @@ def _read_camera(sensor_file: Path, width: int, height: int) -> Camera | None:
         fx, fy, cx, cy = map(float, sensor['intrinsics'])
         return Camera(width, height, fx, fy, cx, cy, str(sensor['distortion_model']),
                       tuple(map(float, sensor['distortion_coefficients'])))
-    except (KeyError, TypeError, ValueError, KfvoError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError, KfvoError) as error:
         raise KfvoError(f'{sensor_file}: expected resolution [2], intrinsics [4], '
                         'distortion_model and distortion_coefficients; '
                         f'problem: {error}') from error
