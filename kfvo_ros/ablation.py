@@ -25,8 +25,10 @@ from kfvo_ros.options import add_arguments, from_arguments, option
 from kfvo_ros.sequences.spelling import spelled_out
 
 if TYPE_CHECKING:
+    from kfvo_ros.backbones.base import Backbone
     from kfvo_ros.learning.ablation_table import Outcome
     from kfvo_ros.learning.examination import Examination
+    from kfvo_ros.learning.plan import Choices
     from kfvo_ros.learning.recipe import Recipe
     from kfvo_ros.learning.trial import Trial
 
@@ -77,39 +79,47 @@ def _ablate(argv: list[str]) -> None:
     import stable_baselines3  # noqa: F401
     import tensorboard  # noqa: F401
 
-    from kfvo_ros.learning.recipe import read_recipe
+    from kfvo_ros import assembly
     from kfvo_ros.learning.trial import Trial
     from kfvo_ros.threads import single_threaded
     folder = Path(arguments.output).expanduser()
     options = replace(options, cache=options.cache or str(folder / CACHE))
-    recipe = read_recipe(options.recipe)
-    trials = [Trial(row, seed, row_recipe(row, recipe, options.steps), folder)
-              for row in rows for seed in seeds]
-    for trial in trials:
-        trial.prepare(options.resume)
+    chosen = _choose(options)
     with single_threaded():
-        examination = _examination(recipe, material.test, options)
-        _go_through(trials, material, options, examination, recipe)
+        backbone = assembly.make_backbone(chosen.odometry)
+        trials: list[Trial] = []
+        for row in rows:
+            changed = replace(chosen, recipe=row_recipe(row, chosen.recipe, options.steps))
+            plan = changed.plan(material.learned, material.validation, backbone)
+            trials += [Trial(row, replace(plan, seed=seed), folder) for seed in seeds]
+        for trial in trials:
+            trial.prepare(options.resume)
+        examination = _examination(chosen, material.test, backbone)
+        _go_through(trials, material, options, examination, chosen.recipe)
     print(f'\n{(folder / PAGE).read_text(encoding="utf-8")}\n'
           f'{folder / PAGE}, {folder / TABLE}, {folder / CURVES}')
 
 
-def _examination(recipe: Recipe, test: Sequence[str], options: AblationOptions) -> Examination:
+def _choose(options: AblationOptions) -> Choices:
+    """Return what the test and all trainings have in common; raises KfvoError."""
+    from kfvo_ros.learning.plan import Choices
+    from kfvo_ros.learning.recipe import read_recipe
+    from kfvo_ros.options import OdometryOptions, SequenceOptions, VggtOptions
+    recipe = read_recipe(options.recipe)
+    odometry = OdometryOptions(scale_rule=recipe.scale)
+    return Choices(odometry.seed, recipe, odometry, SequenceOptions(stop=options.stop),
+                   VggtOptions(), Path(options.cache or '').expanduser())
+
+
+def _examination(chosen: Choices, test: Sequence[str], backbone: Backbone) -> Examination:
     """Return the test, its sequences tracked as in use; raises KfvoError."""
     from tqdm import tqdm
 
-    from kfvo_ros import assembly
     from kfvo_ros.learning.examination import Examination
-    from kfvo_ros.learning.plan import Choices
-    from kfvo_ros.options import OdometryOptions, SequenceOptions, VggtOptions
-    odometry = OdometryOptions(scale_rule=recipe.scale)
-    backbone = assembly.make_backbone(odometry)
-    chosen = Choices(odometry.seed, recipe, odometry, SequenceOptions(stop=options.stop),
-                     VggtOptions(), Path(options.cache or '').expanduser())
     archive = chosen.archive(backbone)
     return Examination({text: archive.whole(text)
                         for text in tqdm(test, unit='sequence', desc='test')},
-                       backbone, odometry)
+                       backbone, chosen.odometry)
 
 
 def _go_through(trials: Sequence[Trial], material: Material, options: AblationOptions,
@@ -119,7 +129,7 @@ def _go_through(trials: Sequence[Trial], material: Material, options: AblationOp
     outcomes = list(examination.unlearned(recipe))
     for number, trial in enumerate(trials, 1):
         print(f'{number} of {len(trials)}: {trial.row}, seed {trial.seed}', flush=True)
-        if trial.is_complete(material.learned, material.validation):
+        if trial.is_complete():
             print(f'{trial.files.output} is complete')
         else:
             _train(trial, material, options)
@@ -137,6 +147,7 @@ def _train(trial: Trial, material: Material, options: AblationOptions) -> None:
         argv += [f'--{name}', str(value)] if value is not None else []
     if trial.files.checkpoint.exists():
         argv.append('--resume')
+    trial.write_recipe()
     if train.main(argv) != 0:
         raise KfvoError(f'{trial.row}, seed {trial.seed}: not learned to the end, for the reason '
                         'above; --resume goes on from there')
@@ -150,8 +161,8 @@ def _write(trials: Sequence[Trial], outcomes: Sequence[Outcome]) -> None:
     in_order = sorted(outcomes, key=lambda each: each.row not in ROWS)  # the learned ones first
     write_csv(folder / TABLE, in_order)
     write_markdown(folder / PAGE, in_order)
-    plot_curves(folder / CURVES, [read_curve(trial.row, trial.recipe.reward, trial.files.folder)
-                                  for trial in trials])
+    plot_curves(folder / CURVES, [
+        read_curve(trial.row, trial.plan.recipe.reward, trial.files.folder) for trial in trials])
 
 
 def _material(arguments: argparse.Namespace) -> Material:

@@ -63,10 +63,11 @@ def _train(argv: list[str]) -> None:
         backbone = assembly.make_backbone(chosen.odometry, chosen.vggt)
         plan = chosen.plan(arguments.sequence, arguments.validation, backbone)
         checkpoint = read_checkpoint(files.checkpoint, plan) if arguments.resume else None
-        validation, scores = _validation(plan, chosen, backbone)
+        # What cannot be learned from is told before hours of validation.
         with closing(make_environment(
                 chosen.lesson(plan), plan.recipe.environments, arguments.workers,
                 plan.seed_at(checkpoint.steps if checkpoint else 0))) as environment:
+            validation, scores = _validation(plan, chosen, backbone)
             files.prepare(arguments.resume)
             about = {'version': __version__,
                      'command': shlex.join(['python', '-m', 'kfvo_ros.train', *argv])}
@@ -81,9 +82,10 @@ def _learn(training: Training, files: TrainingFiles) -> None:
         display = Display(plan.recipe.steps, training.steps, interruptions)
         try:
             training.learn(display)
-        except (KeyboardInterrupt, KfvoError) as problem:
+        except (Interrupted, KfvoError) as problem:
             training.save()
-            reason = 'interrupted' if isinstance(problem, KeyboardInterrupt) else str(problem)
+            # A signal to all processes may have ended what we need: that is not the problem.
+            reason = 'interrupted' if interruptions else str(problem)
             raise KfvoError(
                 f'{reason}; {files.folder} holds the policy after {training.steps} steps '
                 f'({files.last.name}) and the checkpoint from which --resume goes on'

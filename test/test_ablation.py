@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import csv
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -18,7 +19,7 @@ pytest.importorskip('stable_baselines3', reason="stable-baselines3 is not instal
 pytest.importorskip('tensorboard', reason="tensorboard is not installed: pip install '.[train]'")
 pytest.importorskip('matplotlib', reason="matplotlib is not installed: pip install '.[demo]'")
 
-from kfvo_ros import ablation
+from kfvo_ros import ablation, assembly
 from kfvo_ros.config_files import find_config
 from kfvo_ros.keyframes.policy_file import read_policy
 from kfvo_ros.learning.ablation_rows import ROWS, row_recipe
@@ -102,8 +103,10 @@ def test_the_table_has_all_rows_and_the_curves_are_a_picture(done):
 
 def test_a_teacher_has_a_row_of_its_own(folder):
     recipe = read_recipe('train.yaml')
-    options = ablation.AblationOptions(stop=30, cache=str(folder / 'cache'))
-    outcomes = list(ablation._examination(recipe, TESTED[:1], options).unlearned(recipe))
+    chosen = ablation._choose(ablation.AblationOptions(stop=30, cache=str(folder / 'cache')))
+    backbone = assembly.make_backbone(chosen.odometry)
+    examination = ablation._examination(chosen, TESTED[:1], backbone)
+    outcomes = list(examination.unlearned(recipe))
     assert [each.row for each in outcomes if each.row != 'random'] == [
         *UNLEARNED[:3], 'teacher', *UNLEARNED[4:]]
     taught = next(each for each in outcomes if each.row == 'teacher')
@@ -141,8 +144,13 @@ def test_what_is_complete_is_not_trained_again(folder, done, tmp_path, capsys):
     shutil.copytree(done, output)
     (output / 'full-1.safetensors').unlink()
     shutil.rmtree(output / 'full-1.training')
-    before = files(output)
+    before, recipe = files(output), (output / 'local_signals_only.yaml').stat()
+    first = output / 'full-0.training' / 'last.safetensors'
+    told = read_policy(first)
+    replace(told, training={name: value for name, value in told.training.items()
+                            if name != 'reading'}).write(first)  # as an older version did
     assert run(folder, output, '--resume') == 0
+    assert (output / 'local_signals_only.yaml').stat() == recipe
     assert capsys.readouterr().out.count(' is complete\n') == 3
     after = files(output)
     assert {name for name in after if after[name] != before.get(name)} == {'full-1.safetensors'}
@@ -159,22 +167,37 @@ def test_a_training_that_is_not_complete_goes_on(folder, tmp_path, capsys):
     assert curve.errors[:, 0].tolist() == [32.0, 64.0]
 
 
-def test_of_another_training_nothing_is_resumed(folder, done, tmp_path, capsys):
+@pytest.mark.parametrize(('lost', 'others', 'words'), [
+    ('', ['--recipe', 'other.yaml'], 'recipe.ppo.gamma was 0.98, now 0.5. Go on as it began'),
+    ('', ['--stop', 25], 'full-0.training/checkpoint.pt is of another training: reading.stop was '
+     '30, now 25'),
+    ('full-0.training/checkpoint.pt', ['--recipe', 'other.yaml'],
+     'full-0.safetensors is of another training, or has lost its checkpoint')])
+def test_of_another_training_nothing_is_resumed(folder, done, tmp_path, capsys, monkeypatch, lost,
+                                                others, words):
     output = tmp_path / 'other'
     shutil.copytree(done, output)
+    if lost:
+        (output / lost).unlink()
+    monkeypatch.chdir(tmp_path)
     recipe = (folder / 'few.yaml').read_text().replace('gamma: ', 'gamma: 0.5  # ')
     (tmp_path / 'other.yaml').write_text(recipe)
-    assert run(folder, output, '--resume', '--recipe', tmp_path / 'other.yaml') == 1
-    first, second = [line for line in capsys.readouterr().err.splitlines() if 'error:' in line]
-    assert 'recipe.ppo.gamma was ' in first and ', now 0.5' in first
-    assert second.startswith('kfvo_ablation: error: full, seed 0: not learned to the end')
+    assert run(folder, output, '--resume', *others) == 1
+    line, = [line for line in capsys.readouterr().err.splitlines() if 'error:' in line]
+    assert line.startswith('kfvo_ablation: error: ') and words in line
+    for row in TRAINED:  # which the policies name
+        assert (output / f'{row}.yaml').read_bytes() == (done / f'{row}.yaml').read_bytes()
 
 
-def test_nothing_is_overwritten_unasked(folder, done, capsys):
+def test_nothing_is_overwritten_unasked(folder, done, tmp_path, capsys):
     before = files(done)
     assert run(folder, done) == 1
     assert 'full-0.safetensors is there already' in capsys.readouterr().err
     assert files(done) == before
+    (tmp_path / 'local_signals_only-1.safetensors').write_text('precious')
+    assert run(folder, tmp_path) == 1  # before any other is trained
+    assert 'local_signals_only-1.safetensors is there already' in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ['local_signals_only-1.safetensors']
 
 
 @pytest.mark.parametrize(('arguments', 'words'), [

@@ -29,7 +29,7 @@ def policy() -> PrivilegedCritic:
     seen = spaces.Dict({
         OBSERVATION: spaces.Box(-np.inf, np.inf, (SIZE,), np.float32),
         PRIVILEGED: spaces.Box(-np.inf, np.inf, (PRIVILEGED_SIZE,), np.float32)})
-    made = PrivilegedCritic(seen, spaces.Discrete(2), lambda _: 3e-4)
+    made = PrivilegedCritic(seen, spaces.Discrete(2), lambda _: 3e-4, width=256)
     for parameter in made.parameters():  # the last layer begins near zero otherwise
         torch.nn.init.normal_(parameter, std=0.05)
     return made

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import islice, repeat
 
 import numpy as np
@@ -175,6 +176,49 @@ def test_lost_and_unanswered_episodes_never_reach_the_rollout(backbone, drives):
     seen = environment.reset()[OBSERVATION][0]
     alone = KeyframeEnvironment(backbone, [again(drives[1], backbone)], ALL)
     np.testing.assert_array_equal(seen, alone.reset()[OBSERVATION][0])
+
+
+def test_a_lost_camera_ends_the_episode_and_its_frame_is_not_learned_from(drives):
+    class Losing(GeometricBackbone):
+        """Loses the camera in its eleventh window."""
+
+        windows = 0
+
+        def estimate(self, windows):
+            self.windows += len(windows)
+            return [replace(found, status=Status.LOST) if self.windows == 11 else found
+                    for found in super().estimate(windows)]
+
+    losing = Losing()
+    environment = KeyframeEnvironment(losing, [again(drives[0], losing)], ALL)
+    seen = [environment.reset()[OBSERVATION][0]]
+    ended = []
+    for _ in range(6):
+        observations, _, dones, infos = environment.step(np.array([1]))
+        seen.append(observations[OBSERVATION][0])
+        ended.append(bool(dones[0]))
+    # Frames 7 to 10 are decided on; the next one is lost, and the sequence begins again.
+    assert ended == [False, False, False, True, False, False]
+    np.testing.assert_array_equal(seen[4], seen[0])
+    assert infos == [{}]
+
+
+def test_nothing_is_earned_before_the_first_question(backbone, drives):
+    class One(Reward):
+        def __call__(self, T_world_frame, T_truth_frame, keep):
+            return 1.0
+
+    # The gap of any frame is one: until the window is full nobody is asked, then by the rail.
+    forcing = Rail(min_survival=0.0, max_gap=1, min_flow=0.0)
+    episode = Episode(drives[0], backbone, 'depth', 8, forcing, One())
+    other = Episode(drives[0], backbone, 'depth', 8, NO_RAIL, One())
+    for each in (episode, other):
+        while not each.ended and each.decision is None:
+            window = each.enter()
+            each.leave(backbone.estimate([window])[0] if window is not None else None)
+    assert episode.ended and not episode.asked and episode.take_reward() == 0.0
+    other.decide(True)
+    assert other.asked and other.take_reward() == 1.0
 
 
 def test_frames_not_seen_before_are_encoded_in_one_call(backbone, drives):

@@ -13,10 +13,13 @@ pytest.importorskip('stable_baselines3', reason="stable-baselines3 is not instal
 
 import numpy as np
 import torch
+from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecNormalize
 
 from kfvo_ros.backbones.geometric.backbone import GeometricBackbone
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.learning import imitation
+from kfvo_ros.learning.environment import OBSERVATION, PRIVILEGED, Episodes
 from kfvo_ros.learning.plan import Choices
 from kfvo_ros.learning.recipe import read_recipe
 from kfvo_ros.learning.school import make_environment
@@ -33,19 +36,19 @@ def choices(**changes) -> Choices:
                    SequenceOptions(stop=40), VggtOptions(), None)
 
 
-def test_the_actor_decides_as_its_teacher_did_and_the_critic_knows_what_it_is_worth(monkeypatch):
-    monkeypatch.setattr(imitation, 'STEPS', 160)
-    monkeypatch.setattr(imitation, 'PASSES', 40)
+def test_the_actor_decides_as_its_teacher_did_and_the_critic_knows_what_it_is_worth():
     chosen = choices(reward='paper')
     plan = chosen.plan(['synthetic:1-2:smooth'], [], GeometricBackbone())
     environment = make_environment(chosen.lesson(plan), 2, 1, 0)
     model = make_model(environment, plan.recipe, 0)
     asked = []
-    imitation.imitate(model, plan.setting.observation, TEACHER, lambda: asked.append(None))
+    imitation.imitate(model, plan.setting.observation, TEACHER,
+                      replace(plan.recipe.imitation, steps=160, passes=40),
+                      lambda: asked.append(None))
     assert len(asked) == 160
 
     seen, kept, returns = imitation._watch(
-        model.get_vec_normalize_env(), plan.setting.observation, TEACHER, model.gamma,
+        model.get_vec_normalize_env(), plan.setting.observation, TEACHER, 160, model.gamma,
         lambda: None)
     with torch.no_grad():
         chances = model.policy.get_distribution(seen).distribution.probs[:, 1]
@@ -54,6 +57,36 @@ def test_the_actor_decides_as_its_teacher_did_and_the_critic_knows_what_it_is_wo
     assert ((chances > 0.5) == kept.bool()).float().mean() > 0.9
     assert 0.02 < chances.min() < 0.35 and 0.65 < chances.max() < 0.98
     assert ((values - returns) ** 2).mean() < 0.25 * (returns ** 2).mean()
+
+
+def test_what_was_earned_later_counts_less_and_not_beyond_an_episode():
+    class Paying(Episodes):
+        """Pays 1, 2, 3 ... in episodes of two steps, for a flow that its teacher keeps."""
+
+        def __init__(self) -> None:
+            super().__init__(1, spaces.Dict({
+                OBSERVATION: spaces.Box(-np.inf, np.inf, (3,), np.float32),
+                PRIVILEGED: spaces.Box(-np.inf, np.inf, (1,), np.float32)}), spaces.Discrete(2))
+
+        def reset(self):
+            self.steps = 0
+            return {OBSERVATION: np.array([[np.log1p(13.0), 0.0, 1.0]], dtype=np.float32),
+                    PRIVILEGED: np.zeros((1, 1), dtype=np.float32)}
+
+        def step_async(self, actions):
+            assert actions.tolist() == [1]
+
+        def step_wait(self):
+            steps = self.steps + 1
+            told = self.reset()
+            self.steps = steps
+            return told, np.array([steps], dtype=np.float32), np.array([steps % 2 == 0]), [{}]
+
+    layout = (('flow', 1), ('baseline_to_depth', 1), ('track_survival', 1))
+    environment = VecNormalize(Paying(), norm_reward=False)
+    _, kept, returns = imitation._watch(environment, layout, TEACHER, 5, 0.5, lambda: None)
+    assert kept.tolist() == [1] * 5
+    assert returns.tolist() == [1 + 0.5 * 2, 2, 3 + 0.5 * 4, 4, 5]
 
 
 def test_the_teacher_keeps_after_enough_flow_or_baseline_and_when_tracks_are_lost():

@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+import tempfile
+
 import pytest
 import yaml
 
@@ -17,7 +19,8 @@ from kfvo_ros.learning.benchmark import Speed, table
 pytestmark = pytest.mark.usefixtures('own_signals')
 
 
-def test_rows_are_rates_and_nothing_is_tracked_while_measuring(tmp_path, capsys):
+def test_rows_are_rates_and_nothing_is_tracked_while_measuring(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(tempfile, 'tempdir', str(tmp_path))
     recipe = yaml.safe_load(find_config('train.yaml').read_text())
     recipe |= {'environments': 2}
     recipe['ppo'] |= {'n_steps': 16, 'batch_size': 16, 'n_epochs': 1}
@@ -37,6 +40,7 @@ def test_rows_are_rates_and_nothing_is_tracked_while_measuring(tmp_path, capsys)
         assert min(decisions, ppo) > 5.0
         assert placed == pytest.approx(frames * decisions, rel=0.05)
     assert len(list(cache.iterdir())) == 2
+    assert not list(tmp_path.glob('SB3-*'))  # nothing is logged
 
 
 def test_gains_are_against_the_first_row():

@@ -54,6 +54,13 @@ def test_it_is_bounded_and_right_or_wrong_alike():
 
 
 def test_a_window_s_length_says_nothing():
-    truth, reward = walk(LEAST_SPAN - 1), LocalReward(FRAMES, alpha=-0.25)
+    truth, reward = walk(LEAST_SPAN - 1), LocalReward(2 * FRAMES, alpha=-0.25)
     assert reward(drifting(truth, 5.0), truth, False) == 0.0
     assert reward(drifting(truth, 5.0), truth, True) == -0.25
+
+
+def test_where_there_are_but_few_frames_two_thirds_of_them_tell():
+    reward = LocalReward(30)
+    for frames, told in ((19, False), (20, True)):
+        truth = walk(frames)
+        assert (reward(drifting(truth, 5.0), truth, False) != 0.0) == told

@@ -84,6 +84,7 @@ def test_numbers_may_be_written_as_people_do(tmp_path: Path):
     (('steps',), None, 'steps: expected a whole number', 'None'),
     (('ppo', 'gamma'), 1.5, 'ppo.gamma: expected a number at least 0 and at most 1', '1.5'),
     (('ppo', 'gamma'), float('nan'), 'ppo.gamma: expected a number', 'nan'),
+    (('ppo', 'gamma'), 10 ** 400, 'ppo.gamma: expected a number at least 0', '1000'),
     (('ppo', 'normalise_reward'), 1, 'ppo.normalise_reward: expected true or false', '1'),
     (('reward',), 'praise', 'reward: expected one of local, paper', "'praise'"),
     (('rail', 'min_survival'), 2, 'rail.min_survival: expected a number at least 0 and at most 1',
@@ -104,7 +105,7 @@ def test_missing_keys_and_files_are_named(tmp_path: Path):
         read_changed(tmp_path, 'ppo', 'gamma', drop=True)
     with pytest.raises(KfvoError, match='cannot read the recipe none_such.yaml'):
         read_recipe('none_such.yaml')
-    for content in (': :', '!!python/object/apply:os.getcwd []', '\x00', '- 1'):
+    for content in (': :', '!!python/object/apply:os.getcwd []', '\x00', '- 1', '[' * 5000):
         (tmp_path / 'bad.yaml').write_text(content)
         with pytest.raises(KfvoError, match='bad.yaml'):
             read_recipe(str(tmp_path / 'bad.yaml'))

@@ -4,19 +4,28 @@
 
 from __future__ import annotations
 
+import gc
+import json
+import os
+import weakref
 from pathlib import Path
 
 import numpy as np
 import pytest
+from safetensors import safe_open
+from safetensors.numpy import load_file, save_file
+from sequence_writers import DATASETS, make_image, make_poses, write_camera_info
 
 pytest.importorskip('stable_baselines3', reason="stable-baselines3 is not installed: pip install "
                     "'.[train]'")
 
 from kfvo_ros.backbones.geometric.backbone import GeometricBackbone
 from kfvo_ros.errors import KfvoError
+from kfvo_ros.keyframes.rail import Rail
+from kfvo_ros.learning import school
 from kfvo_ros.learning.archive import Archive
 from kfvo_ros.learning.augmentation import Augmentation
-from kfvo_ros.learning.drive_file import read_drive, write_drive
+from kfvo_ros.learning.drive_file import KEY, read_drive, write_drive
 from kfvo_ros.learning.drives import record
 from kfvo_ros.learning.environment import OBSERVATION, PRIVILEGED
 from kfvo_ros.learning.school import Lesson, make_environment
@@ -83,14 +92,58 @@ def test_a_damaged_file_is_as_good_as_none(backbone, tmp_path, damage):
     assert read_drive(path) is None
 
 
-def test_a_variant_is_tracked_once(backbone, tmp_path):
-    class Counting(GeometricBackbone):
-        opened = 0
+@pytest.fixture(scope='module')
+def drive_file(backbone, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp('drive') / 'drive.safetensors'
+    write_drive(path, record(SyntheticSequence(2, 'smooth', 8, 160, 120), backbone))
+    return path
 
-        def open(self, camera):
-            Counting.opened += 1
-            return super().open(camera)
 
+@pytest.mark.parametrize('camera', [{'distortion_model': 5}, {'fx': -1}, {'fx': 10 ** 400}])
+def test_a_drive_of_an_impossible_camera_is_as_good_as_none(drive_file, tmp_path, camera):
+    path = tmp_path / 'drive.safetensors'
+    with safe_open(drive_file, 'np') as file:
+        head = json.loads(file.metadata()[KEY])
+    save_file(load_file(drive_file), path, {KEY: json.dumps(head)})
+    assert read_drive(path) is not None
+    head['camera'] |= camera
+    save_file(load_file(drive_file), path, {KEY: json.dumps(head)})
+    assert read_drive(path) is None
+
+
+@pytest.mark.parametrize(('name', 'change'), [
+    ('T_truth_camera', lambda array: array[:3]),
+    ('T_truth_camera', lambda array: array[:, :3]),
+    ('T_truth_camera', lambda array: array * np.nan),
+    ('descriptors', lambda array: array[:, :-1]),
+    ('descriptors', lambda array: array * np.inf),
+    ('counts', lambda array: array + 1),
+    ('ids', lambda array: array[1:]),
+    ('pixels', lambda array: array * np.nan)])
+def test_a_drive_whose_arrays_do_not_fit_is_as_good_as_none(drive_file, tmp_path, name, change):
+    path = tmp_path / 'drive.safetensors'
+    arrays = load_file(drive_file)
+    with safe_open(drive_file, 'np') as file:
+        head = file.metadata()
+    changed = np.ascontiguousarray(change(arrays[name]))
+    save_file(arrays | {name: changed}, path, head)
+    assert read_drive(path) is None
+
+
+class Counting(GeometricBackbone):
+    opened = 0
+
+    def open(self, camera):
+        Counting.opened += 1
+        return super().open(camera)
+
+
+@pytest.fixture(autouse=True)
+def nothing_opened() -> None:
+    Counting.opened = 0
+
+
+def test_a_variant_is_tracked_once(tmp_path):
     for _ in range(2):
         archive = Archive(Counting(), READING, {'seed': 0}, tmp_path)
         for _ in range(2):
@@ -101,6 +154,76 @@ def test_a_variant_is_tracked_once(backbone, tmp_path):
                   Archive(Counting(), SequenceOptions(stop=25), {'seed': 0}, tmp_path)):
         other.whole(SEQUENCES[0])
     assert Counting.opened == 4
+
+
+def add_a_line(path: Path) -> None:
+    path.write_text(path.read_text() + '# changed\n')
+
+
+def touch(path: Path) -> None:
+    """Make a file a later one, of the same size."""
+    os.utime(path, ns=(0, path.stat().st_mtime_ns + 1))
+
+
+@pytest.mark.parametrize(('kind', 'change'), [
+    ('euroc', lambda path: add_a_line(path / 'mav0/state_groundtruth_estimate0/data.csv')),
+    ('euroc', lambda path: touch(path / 'mav0/cam0/sensor.yaml')),
+    ('euroc', lambda path: touch(sorted((path / 'mav0/cam0/data').iterdir())[0])),
+    ('tartanair', lambda path: add_a_line(path / 'pose_left.txt')),
+    ('kitti', lambda path: touch(path.parents[1] / 'poses' / '03.txt'))])
+def test_of_a_sequence_that_changed_old_tracks_are_not_served(kind, change, tmp_path):
+    path, _ = DATASETS[kind](tmp_path, [make_image(index) for index in range(20)],
+                             make_poses(20))
+    for _ in range(2):
+        Archive(Counting(), SequenceOptions(), folder=tmp_path / 'cache').whole(str(path))
+    assert Counting.opened == 1
+    change(path)
+    Archive(Counting(), SequenceOptions(), folder=tmp_path / 'cache').whole(str(path))
+    assert Counting.opened == 2
+
+
+def test_what_is_beside_a_file_belongs_to_it_and_not_to_what_is_rendered(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'drive.bag').write_text('a bag')
+    archive = Archive(Counting(), READING)
+    before = [archive._key(text, None, 0) for text in ('drive.bag', SEQUENCES[0])]
+    write_camera_info(tmp_path, 30.0)
+    after = [archive._key(text, None, 0) for text in ('drive.bag', SEQUENCES[0])]
+    assert before[0] != after[0] and before[1] == after[1]
+
+
+def test_with_another_calibration_old_tracks_are_not_served(tmp_path):
+    path, _ = DATASETS['tartanair'](tmp_path, [make_image(index) for index in range(20)],
+                                    make_poses(20))
+    for count, focal in enumerate((30.0, 30.0, 31.0)):
+        write_camera_info(tmp_path, focal)
+        reading = SequenceOptions(camera=str(tmp_path / 'camera_info.yaml'))
+        Archive(Counting(), reading, folder=tmp_path / 'cache').whole(str(path))
+        assert Counting.opened == max(count, 1)
+
+
+class Circle:
+    """Garbage that only a search for it finds."""
+
+    def __init__(self) -> None:
+        self.itself = self
+
+
+def test_drives_that_are_not_searched_for_garbage_keep_none(backbone):
+    archive = Archive(backbone, READING)
+    garbage, used = Circle(), Circle()
+    watched = [weakref.ref(each) for each in (garbage, used)]
+    gc.disable()
+    try:
+        del garbage
+        archive.whole(SEQUENCES[0])
+        assert gc.get_freeze_count() > 0 and watched[0]() is None
+        del used
+        Archive(backbone, READING)
+        gc.collect()
+        assert watched[1]() is None
+    finally:
+        gc.enable()
 
 
 def test_workers_change_nothing(cache):
@@ -115,6 +238,28 @@ def test_a_seed_makes_the_episodes(cache):
                            for seed in (0, 0, 1))
     np.testing.assert_array_equal(first, again)
     assert (first != other).any()
+
+
+def test_episodes_begin_anywhere_but_at_the_very_end(cache, monkeypatch):
+    monkeypatch.setattr(school, 'LEAST_LEFT', 20)
+    lengths = []
+    usual = school.Episode
+
+    def begin(drive, *others):
+        lengths.append(len(drive))
+        return usual(drive, *others)
+
+    monkeypatch.setattr(school, 'Episode', begin)
+    run(lesson(cache), 1, steps=100)
+    assert min(lengths) >= 20 and len(set(lengths)) > 4
+
+
+def test_where_there_is_never_anything_to_decide_it_ends(cache, monkeypatch):
+    monkeypatch.setattr(school, 'MOST_UNASKED', 3)
+    environment = make_environment(lesson(cache, rail=Rail(0.0, 1, 0.0)), 2, 1, 0)
+    with pytest.raises(KfvoError, match='synthetic:.* expected decisions to learn from, '
+                                        'there were none in 3 episodes'):
+        environment.reset()
 
 
 def test_parts_of_the_observation_can_be_hidden(cache):

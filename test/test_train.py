@@ -5,9 +5,13 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
+import os
 import shutil
 import signal
+import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import yaml
@@ -22,7 +26,11 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from kfvo_ros import run, train
 from kfvo_ros.config_files import find_config
+from kfvo_ros.errors import KfvoError
+from kfvo_ros.interruption import SIGNALS
 from kfvo_ros.keyframes.policy_file import read_policy
+from kfvo_ros.learning.files import TrainingFiles
+from kfvo_ros.learning.training import Training
 
 pytestmark = pytest.mark.usefixtures('own_signals')
 
@@ -65,6 +73,12 @@ def scalars(folder: Path) -> dict[str, list[int]]:
             for name in logs.Tags()['scalars']}
 
 
+def open_logs() -> list[threading.Thread]:
+    """Return the threads that write logs."""
+    return [each for each in threading.enumerate()
+            if type(each).__module__.startswith('tensorboard')]
+
+
 def test_smoke_needs_nothing_else(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert train.main(['--smoke', '--stop', '30', '--steps', '200', '--output',
@@ -74,6 +88,7 @@ def test_smoke_needs_nothing_else(tmp_path, monkeypatch, capsys):
     assert rows[1:6] == ['every', 'optical_flow', 'survival', 'teacher', 'learned,']
     assert 'best' in output.splitlines()[5]
     assert read_policy(Path('smoke.safetensors')).training['steps'] == 200
+    assert not open_logs()
 
 
 def test_files_logs_and_what_the_policy_tells_of_itself(trained):
@@ -89,6 +104,7 @@ def test_files_logs_and_what_the_policy_tells_of_itself(trained):
     assert (told['steps'], told['seed'], told['recipe']['ppo']['n_steps']) == (64, 0, 16)
     assert told['sequences'] == ['synthetic:1:smooth', 'synthetic:2:smooth']
     assert told['validation'] == ['synthetic:3:smooth']
+    assert (told['reading']['stop'], told['reading']['rate'], told['vggt']) == (25, 10.0, None)
     assert told['command'].startswith('python -m kfvo_ros.train synthetic:1-2:smooth')
     assert all(0.0 < told['scores'][name]['ate_percent'] < 50.0
                and 0.1 < told['scores'][name]['kept'] <= 1.0
@@ -129,6 +145,57 @@ def test_a_training_goes_on_where_it_ended(folder, trained, tmp_path, monkeypatc
     seen = [each['statistics']['observation']['count'] for each in (before, after)]
     assert seen[1] - seen[0] == pytest.approx(34)  # the first observations, too
     assert scalars(Path())['train/learning_rate'] == [32, 64, 96]
+
+
+def test_without_a_best_policy_the_next_one_is_it(folder, trained, tmp_path, monkeypatch):
+    shutil.copytree(trained, tmp_path / 'again')
+    monkeypatch.chdir(tmp_path / 'again')
+    Path(POLICY).unlink()
+    assert train.main(arguments(folder, '--resume')) == 0
+    assert read_policy(Path(POLICY)).training['steps'] == 64
+
+
+def test_sequences_read_otherwise_are_another_training(folder, trained, monkeypatch, capsys):
+    monkeypatch.chdir(trained)
+    assert train.main(arguments(folder, '--resume', '--stop', 30, '--rate', 5)) == 1
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert 'reading.rate was 10.0, now 5.0; reading.stop was 25, now 30. Go on as it ' in line
+
+
+@pytest.mark.parametrize('number', SIGNALS)
+def test_a_signal_to_all_processes_interrupts_and_saves(number, folder, trained, tmp_path,
+                                                        monkeypatch, capsys):
+    after_update = Training.after_update
+
+    def interrupted(training: Training, *arguments) -> None:
+        after_update(training, *arguments)
+        for process in multiprocessing.active_children():
+            os.kill(process.pid, number)
+        signal.raise_signal(number)
+
+    monkeypatch.setattr(Training, 'after_update', interrupted)
+    monkeypatch.chdir(tmp_path)
+    assert train.main(arguments(folder, '--workers', 2)) == 1
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert line.startswith('kfvo_train: error: interrupted; policy.training holds the policy '
+                           'after 32 steps')
+    assert read_policy(Path('policy.training/last.safetensors')).training['steps'] == 32
+    assert torch.load('policy.training/checkpoint.pt', weights_only=True)['steps'] == 32
+    assert not open_logs()
+
+
+def test_what_a_signal_ended_is_not_the_problem():
+    saved = []
+
+    def learn(display) -> None:
+        signal.raise_signal(signal.SIGTERM)
+        raise KfvoError('a worker process ended')
+
+    training = SimpleNamespace(steps=7, learn=learn, save=lambda: saved.append(7),
+                               plan=SimpleNamespace(recipe=SimpleNamespace(steps=9)))
+    with pytest.raises(KfvoError, match='^interrupted; .* holds the policy after 7 steps'):
+        train._learn(training, TrainingFiles(POLICY))
+    assert saved == [7]
 
 
 def test_what_was_learned_survives_an_interruption(folder, trained, tmp_path):

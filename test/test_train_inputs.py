@@ -23,6 +23,7 @@ from kfvo_ros.keyframes.learned import Setting
 from kfvo_ros.learning.checkpoint import Checkpoint, read_checkpoint
 from kfvo_ros.learning.plan import Plan
 from kfvo_ros.learning.recipe import read_recipe
+from kfvo_ros.options import SequenceOptions, VggtOptions
 
 SETTING = Setting('geometric', 'depth', 8, (('descriptor', 48), ('poses', 49)))
 
@@ -35,7 +36,8 @@ def elsewhere(tmp_path, monkeypatch, own_signals) -> None:
 
 @pytest.fixture
 def plan() -> Plan:
-    return Plan(('synthetic:1',), (), 0, SETTING, read_recipe('train.yaml'))
+    return Plan(('synthetic:1',), (), 0, SETTING, read_recipe('train.yaml'), SequenceOptions(),
+                VggtOptions())
 
 
 def refused(capsys, *arguments: str) -> str:
@@ -77,12 +79,24 @@ def test_an_unknown_part_is_refused(capsys, tmp_path):
     assert line.endswith('came pose')
 
 
-def test_a_sequence_without_truth_is_refused(capsys, tmp_path):
+@pytest.fixture
+def untrue(tmp_path) -> str:
+    """Return a folder of images, whose camera was nobody knows where."""
     folder = tmp_path / 'images'
     for index in range(25):
         write_image(folder / f'{index:03d}.png', make_image(index))
     write_camera_info(folder, 20.0)
-    line = refused(capsys, '--validation', str(folder))
+    return str(folder)
+
+
+def test_a_sequence_without_truth_is_refused(untrue, capsys):
+    line = refused(capsys, '--validation', untrue)
+    assert 'expected ground truth of the camera to learn from, none came' in line
+
+
+def test_to_learn_from_it_is_refused_before_anything_is_validated(untrue, capsys, monkeypatch):
+    monkeypatch.setattr(train, '_validation', lambda *_: pytest.fail('too late'))
+    line = refused(capsys, 'synthetic:1', untrue, '--validation', 'synthetic:3')
     assert 'expected ground truth of the camera to learn from, none came' in line
 
 
@@ -102,7 +116,8 @@ class Trap:
 
 
 @pytest.mark.filterwarnings('ignore:Detected pickle protocol')
-@pytest.mark.parametrize('how', ['pickle', 'torch', 'text', 'empty', 'tensor', 'version', 'cut'])
+@pytest.mark.parametrize('how', ['pickle', 'torch', 'text', 'empty', 'tensor', 'version', 'cut',
+                                 'number'])
 def test_a_bad_checkpoint_is_one_clear_line_and_never_unpickled(how, plan, tmp_path):
     path = tmp_path / 'checkpoint.pt'
     good = {'format_version': 1, 'plan': {}, 'steps': 1, 'best': 1.0, 'parameters': {},
@@ -118,6 +133,8 @@ def test_a_bad_checkpoint_is_one_clear_line_and_never_unpickled(how, plan, tmp_p
     elif how == 'cut':
         torch.save(good, path)
         path.write_bytes(path.read_bytes()[:200])
+    elif how == 'number':
+        torch.save(good | {'plan': 5}, path)
     else:
         path.write_text('a checkpoint' if how == 'text' else '')
     with pytest.raises(KfvoError) as refusal:
@@ -127,11 +144,24 @@ def test_a_bad_checkpoint_is_one_clear_line_and_never_unpickled(how, plan, tmp_p
     assert '\n' not in line and not (tmp_path / 'sprung').exists()
 
 
+@pytest.mark.parametrize('change', [
+    {'seed': torch.zeros(2)}, {'sequences': (torch.zeros(2),)}, {'setting': {'observation': {1}}},
+    {7: 'seven'}])
+def test_a_plan_of_odd_values_is_one_clear_line(change, plan, tmp_path):
+    path = tmp_path / 'checkpoint.pt'
+    Checkpoint(asdict(plan) | change, 5, 1.0, {}, {}).write(path)
+    with pytest.raises(KfvoError, match='expected a checkpoint that kfvo_train wrote') as refusal:
+        read_checkpoint(path, plan)
+    assert '\n' not in str(refusal.value)
+
+
 def test_a_checkpoint_goes_on_with_its_own_plan_only(plan, tmp_path):
     path = tmp_path / 'checkpoint.pt'
     Checkpoint(asdict(plan), 5, 1.0, {}, {}).write(path)
     longer = replace(plan, recipe=replace(plan.recipe, steps=7, validation_every=1))
-    assert read_checkpoint(path, plan).steps == read_checkpoint(path, longer).steps == 5
+    moved = replace(plan, vggt=VggtOptions(device='cpu', recompute=True, compile=True))
+    for same in (plan, longer, moved):
+        assert read_checkpoint(path, same).steps == 5
     ppo = replace(plan.recipe.ppo, gamma=0.5)
     smaller = replace(SETTING, observation=SETTING.observation[:1])
     for other, words in (
@@ -140,7 +170,18 @@ def test_a_checkpoint_goes_on_with_its_own_plan_only(plan, tmp_path):
             (replace(plan, setting=smaller), 'setting.observation was'),
             (replace(plan, seed=3), 'seed was 0, now 3'),
             (replace(plan, recipe=replace(plan.recipe, rail=None)), 'recipe.rail was'),
+            (replace(plan, reading=SequenceOptions(stop=9)), 'reading.stop was None, now 9'),
+            (replace(plan, reading=SequenceOptions(camera='my.yaml', rate=20.0)),
+             "reading.camera was None, now 'my.yaml'; reading.rate was 10.0, now 20.0"),
+            (replace(plan, vggt=VggtOptions('my.pt')), "vggt.weights was 'facebook/VGGT-1B'"),
             (replace(plan, sequences=('synthetic:2',)), 'sequences was')):
         with pytest.raises(KfvoError, match='is of another training') as refusal:
             read_checkpoint(path, other)
         assert words in str(refusal.value) and '\n' not in str(refusal.value)
+
+
+def test_a_checkpoint_of_an_older_version_does_not_tell_everything(plan, tmp_path):
+    path = tmp_path / 'checkpoint.pt'
+    told = {name: value for name, value in asdict(plan).items() if name not in ('reading', 'vggt')}
+    Checkpoint(told, 5, 1.0, {}, {}).write(path)
+    assert read_checkpoint(path, plan).steps == 5

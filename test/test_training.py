@@ -122,6 +122,13 @@ def test_vggt_learns_with_the_rail_that_it_can_have(small_vggt, tmp_path, monkey
     assert [name for name, _ in policy.setting.observation] == ['descriptor', 'poses']
     assert run.main(['synthetic:5', '--keyframes', 'learned', '--policy', 'policy.safetensors',
                      '--scale', 'none', '--output', 'out', *vggt]) == 0
+    assert policy.training['vggt']['weights'] == str(small_vggt)
+    capsys.readouterr()
+    assert train.main([
+        'synthetic:1-2:smooth', '--validation', 'synthetic:3:smooth', '--recipe', 'own.yaml',
+        '--environments', '2', *vggt, '--image-width', '84', '--output', 'policy.safetensors',
+        '--resume']) == 1
+    assert 'vggt.image_width was 70, now 84' in capsys.readouterr().err
 
 
 def test_parts_that_are_left_out_are_neither_trained_nor_asked(tmp_path, monkeypatch):

@@ -17,9 +17,10 @@ class Rail:
 
     `min_survival`, the share of the last keyframe's tracks that must be left, and `max_gap`,
     the input frames since then, force to keep; less than `min_flow` [px] of mean motion since
-    then forces to drop; zero, or None for the gap, forces nothing. Without tracks only the gap
-    counts. It is part of a learned policy: a policy that was trained inside it knows nothing of
-    what is outside. Raises ValueError for values out of range.
+    then forces to drop, and too few tracks to tell the motion to keep; zero, or None for the
+    gap, forces nothing. Without tracks only the gap counts. It is part of a learned policy: one
+    that was trained inside it knows nothing of what is outside. Raises ValueError for values out
+    of range.
     """
 
     min_survival: float = 0.5

@@ -14,8 +14,6 @@ from torch import Tensor, nn
 
 from kfvo_ros.learning.environment import OBSERVATION, PRIVILEGED
 
-WIDTH = 256
-
 
 class SideBySide(BaseFeaturesExtractor):
     """The observation, and behind it what is privileged, as they are."""
@@ -31,16 +29,15 @@ class SideBySide(BaseFeaturesExtractor):
 class TwoNetworks(nn.Module):
     """Two ReLU networks of two layers each; the last layer of either is the policy's own."""
 
-    latent_dim_pi = latent_dim_vf = WIDTH
-
-    def __init__(self, observed: int, privileged: int) -> None:
+    def __init__(self, observed: int, privileged: int, width: int) -> None:
         super().__init__()
         self.observed = observed
-        self.actor = _layers(observed)
-        self.critic = _layers(observed + privileged)
+        self.latent_dim_pi = self.latent_dim_vf = width
+        self.actor = _layers(observed, width)
+        self.critic = _layers(observed + privileged, width)
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the last hidden layers of both, (B, WIDTH)."""
+        """Return the last hidden layers of both, (B, width)."""
         return self.forward_actor(features), self.forward_critic(features)
 
     def forward_actor(self, features: Tensor) -> Tensor:
@@ -53,15 +50,19 @@ class TwoNetworks(nn.Module):
 
 
 class PrivilegedCritic(ActorCriticPolicy):
-    """For `PPO(PrivilegedCritic, environment)`. Source: the paper, sections IV-C and IV-E."""
+    """For `PPO(PrivilegedCritic, environment, policy_kwargs={'width': 256})`.
 
-    def __init__(self, *arguments: Any, **options: Any) -> None:
+    Source: the paper, sections IV-C and IV-E.
+    """
+
+    def __init__(self, *arguments: Any, width: int, **options: Any) -> None:
+        self._width = width
         super().__init__(*arguments, **options | {'features_extractor_class': SideBySide})
 
     def _build_mlp_extractor(self) -> None:
         assert isinstance(self.observation_space, spaces.Dict)
         observed, privileged = _sizes(self.observation_space)
-        self.mlp_extractor = TwoNetworks(observed, privileged)  # type: ignore[assignment]
+        self.mlp_extractor = TwoNetworks(observed, privileged, self._width)  # type: ignore[assignment]
 
 
 def _sizes(space: spaces.Dict) -> list[int]:
@@ -69,5 +70,5 @@ def _sizes(space: spaces.Dict) -> list[int]:
     return [spaces.flatdim(space[name]) for name in (OBSERVATION, PRIVILEGED)]
 
 
-def _layers(size: int) -> nn.Sequential:
-    return nn.Sequential(nn.Linear(size, WIDTH), nn.ReLU(), nn.Linear(WIDTH, WIDTH), nn.ReLU())
+def _layers(size: int, width: int) -> nn.Sequential:
+    return nn.Sequential(nn.Linear(size, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU())

@@ -21,7 +21,7 @@ from kfvo_ros.learning.plan import Plan
 FORMAT_VERSION = 1
 RETURNS = 'returns'
 EXPECTED = 'expected a checkpoint that kfvo_train wrote'
-FREE = ('recipe.steps', 'recipe.validation_every')
+FREE = ('recipe.steps', 'recipe.validation_every', 'vggt.device', 'vggt.recompute', 'vggt.compile')
 """What may be another one when a training goes on."""
 
 
@@ -89,22 +89,36 @@ def read_checkpoint(path: Path, plan: Plan) -> Checkpoint:
         checkpoint = Checkpoint(**content)
         if not isinstance(checkpoint.steps, int) or not isinstance(checkpoint.best, float):
             raise TypeError(f'{checkpoint.steps!r} steps, best {checkpoint.best!r}')
+        if not isinstance(checkpoint.plan, dict) or not _is_plain(checkpoint.plan):
+            raise TypeError('a plan of plain values is needed')
     except Exception as error:  # of what is no checkpoint torch's reader raises whatever comes
         # Its own words advise to let the code in the file run.
         raise KfvoError(f'{path}: {EXPECTED}; something else came') from error
-    changes = list(_changes(checkpoint.plan, asdict(plan)))
-    if changes:
-        raise KfvoError(f'{path} is of another training: {"; ".join(changes)}. Go on as it '
-                        'began, or begin anew with --overwrite')
+    changed = list(changes(checkpoint.plan, asdict(plan)))
+    if changed:
+        raise KfvoError(f'{path} is of another training: {"; ".join(changed)}. Go on as it '
+                        'began, or begin anew with kfvo_train --overwrite')
     return checkpoint
 
 
-def _changes(before: Any, now: Any, place: str = '') -> Iterator[str]:
-    """Yield where two trees of plain values differ, in words."""
+def _is_plain(value: Any) -> bool:
+    """Whether a tree is of words, numbers and None alone: tensors do not compare as a whole."""
+    if isinstance(value, dict):
+        return all(isinstance(name, str) and _is_plain(each) for name, each in value.items())
+    if isinstance(value, (list, tuple)):
+        return all(map(_is_plain, value))
+    return value is None or isinstance(value, (str, int, float))
+
+
+def changes(before: Any, now: Any, place: str = '') -> Iterator[str]:
+    """Yield where two trees of plain values differ, in words.
+
+    What a file does not tell, because an older version wrote it, is as it is now.
+    """
     if place in FREE:
         return
     if isinstance(before, dict) and isinstance(now, dict):
-        for name in sorted({*before, *now}):
-            yield from _changes(before.get(name), now.get(name), f'{place}.{name}'.lstrip('.'))
+        for name in sorted(before):
+            yield from changes(before[name], now.get(name), f'{place}.{name}'.lstrip('.'))
     elif before != now:
         yield f'{place} was {before!r}, now {now!r}'

@@ -50,9 +50,10 @@ class KeyframeEnvironment(Episodes):
 
     `sources` give episodes for ever; `indices` say what is seen of an observation. What is
     observed and rewarded are decisions only: an episode is driven to its first one before
-    anybody sees it, and one that ends without any is passed over. The end of an episode is that
-    of what was recorded, not of the world: it is told as truncation, with the last decision's
-    observation. Observations are not standardised yet.
+    anybody sees it, and one that ends without any is passed over. The end of an episode, of what
+    was recorded or because the camera is lost, is not that of the world: it is told as
+    truncation, with the last decision's observation for want of a later one. Observations are
+    not standardised yet.
     """
 
     def __init__(self, backbone: Backbone, sources: Sequence[Iterator[Episode]],

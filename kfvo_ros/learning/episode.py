@@ -29,7 +29,7 @@ class Episode:
 
     ``decision`` is what the policy sees there, None before the first one and once it ``ended``:
     at the last frame, or when the camera is lost. Where the rail decides nobody is asked, and
-    before the first question nothing is earned. The caller runs the backbone: encode what is
+    before anybody was ``asked`` nothing is earned. The caller runs the backbone: encode what is
     `unseen`, `enter`, estimate the window, `leave`, until there is a decision.
     """
 
@@ -42,7 +42,7 @@ class Episode:
         self._next = 0
         self.decision: DecisionInput | None = None
         self.ended = False
-        self._asked = False
+        self.asked = False
         self._earned = 0.0
 
     def unseen(self) -> tuple[Stream, Frame] | None:
@@ -67,7 +67,7 @@ class Episode:
             return
         forced = self._rail.forced(decision)
         if forced is None:
-            self.decision, self._asked = decision, True
+            self.decision, self.asked = decision, True
         else:
             self.decide(forced)
 
@@ -76,7 +76,7 @@ class Episode:
         window = self._window() if self._reward.span is None else None
         self._commit(keep)
         worth = self._reward(*(window or self._recent()), keep)
-        self._earned += worth if self._asked else 0.0
+        self._earned += worth if self.asked else 0.0
         self.decision = None
         self.ended = self._next == len(self._drive)
 

@@ -20,45 +20,44 @@ from torch.nn.functional import mse_loss
 from kfvo_ros.keyframes.observation import Layout
 from kfvo_ros.learning.actor_critic import PrivilegedCritic
 from kfvo_ros.learning.environment import OBSERVATION, Observations
+from kfvo_ros.learning.recipe import Imitation
 from kfvo_ros.learning.teacher import Teacher
 
-STEPS = 256
-PASSES, BATCH, LEARNING_RATE = 24, 256, 1e-3
-CERTAINTY = 0.9
-"""So sure of the teacher's decisions the pupil becomes: some of them it still tries otherwise."""
 
-
-def imitate(model: PPO, layout: Layout, teacher: Teacher,
+def imitate(model: PPO, layout: Layout, teacher: Teacher, how: Imitation,
             before_each: Callable[[], None] = lambda: None) -> None:
     """Teach the actor to decide as the teacher does, and the critic what that is worth.
 
-    `layout` is that of the model's observation; the caller has a say `before_each` of STEPS
-    decisions in every environment.
+    `layout` is that of the model's observation; the caller has a say `before_each` step.
     """
     environment, policy = model.get_vec_normalize_env(), model.policy
     assert isinstance(environment, VecNormalize) and isinstance(policy, PrivilegedCritic)
-    seen, kept, returns = _watch(environment, layout, teacher, model.gamma, before_each)
-    optimiser = torch.optim.Adam(policy.parameters(), LEARNING_RATE)
+    seen, kept, returns = _watch(environment, layout, teacher, how.steps, model.gamma,
+                                 before_each)
+    optimiser = torch.optim.Adam(policy.parameters(), how.learning_rate)
     dice = torch.Generator().manual_seed(model.seed or 0)
-    for _ in range(PASSES):
-        for rows in torch.randperm(len(kept), generator=dice).split(BATCH):
+    for _ in range(how.passes):
+        for rows in torch.randperm(len(kept), generator=dice).split(how.batch_size):
             batch = {name: values[rows] for name, values in seen.items()}
             values, right, _ = policy.evaluate_actions(batch, kept[rows])
             wrong = torch.log1p(-right.exp().clamp(max=1.0 - 1e-6))
             loss = (0.5 * mse_loss(values.flatten(), returns[rows])
-                    - (CERTAINTY * right + (1.0 - CERTAINTY) * wrong).mean())
+                    - (how.certainty * right + (1.0 - how.certainty) * wrong).mean())
             optimiser.zero_grad()
             loss.backward()
             optimiser.step()
 
 
-def _watch(environment: VecNormalize, layout: Layout, teacher: Teacher, gamma: float,
+def _watch(environment: VecNormalize, layout: Layout, teacher: Teacher, steps: int, gamma: float,
            before_each: Callable[[], None]) -> tuple[dict[str, Tensor], Tensor, Tensor]:
-    """Return what the teacher saw, standardised, did, and earned from then on, discounted."""
+    """Return what the teacher saw, standardised, did, and earned from then on, discounted.
+
+    What would be earned after the end of an episode, or of the steps, is not known: nothing.
+    """
     environment.reset()
     seen: list[Observations] = []
     kept, rewards, dones = [], [], []
-    for _ in range(STEPS):
+    for _ in range(steps):
         before_each()
         told = environment.get_original_obs()
         assert isinstance(told, dict)

@@ -9,8 +9,9 @@ import numpy as np
 from kfvo_ros import geometry
 from kfvo_ros.learning.reward import Reward
 
-LEAST_SPAN = 100
-"""Fewer frames say more of the noise in a pose than of what keyframes do to a trajectory."""
+LEAST_SPAN, LEAST_SHARE = 100, 2 / 3
+"""Fewer frames say more of the noise in a pose than of what keyframes do to a trajectory; where
+there are no more, this share of them has to tell."""
 ACCEPTED_SHARE, ACCEPTED_M = 3e-3, 2e-3
 """An error of this share of the path and so many metres is worth nothing, good or bad ..."""
 MOST = 3.0
@@ -28,13 +29,14 @@ class LocalReward(Reward):
 
     def __init__(self, span: int, alpha: float = 0.0) -> None:
         self.span = span
+        self._least = min(LEAST_SPAN, round(LEAST_SHARE * span))
         self._alpha = alpha
 
     def __call__(self, T_world_frame: np.ndarray, T_truth_frame: np.ndarray,
                  keep: bool) -> float:
         """Return the reward of a decision; without enough frames nothing is lost or won."""
         before = self.standing
-        if len(T_world_frame) >= LEAST_SPAN:
+        if len(T_world_frame) >= self._least:
             self.standing = standing_of(T_world_frame[:, :3, 3], T_truth_frame[:, :3, 3])
         return self.standing - before + self._alpha * keep
 

@@ -29,7 +29,8 @@ class Plan:
     """A training goes on from a checkpoint of the same plan only.
 
     ``sequences`` are learned from, ``validation`` chooses the best policy; ``setting`` is the
-    policy's, with the parts of the observation that it sees.
+    policy's, with the parts of the observation that it sees. ``reading`` tells how sequences are
+    read, ``vggt`` the choices of that backbone, None where it is another.
     """
 
     sequences: tuple[str, ...]
@@ -37,6 +38,8 @@ class Plan:
     seed: int
     setting: Setting
     recipe: Recipe
+    reading: SequenceOptions
+    vggt: VggtOptions | None
 
     def seed_at(self, steps: int) -> int:
         """Return the seed of what comes after so many steps: nothing is driven again."""
@@ -79,8 +82,8 @@ class Choices:
         if missing:
             raise KfvoError('teacher: expected null where its pupil does not observe '
                             f'{" and ".join(missing)}')
-        return Plan(learned, held_out, self.seed, replace(present, observation=seen),
-                    recipe)
+        return Plan(learned, held_out, self.seed, replace(present, observation=seen), recipe,
+                    self.reading, self.vggt if self.odometry.backbone == 'vggt' else None)
 
     def lesson(self, plan: Plan) -> Lesson:
         """Return what environments are made from."""

@@ -1,15 +1,13 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Every number that a training depends on, from one YAML file of the config folder."""
+"""Every number that is chosen for a training, from one YAML file of the config folder."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import yaml
-
 from kfvo_ros.config_files import find_config
-from kfvo_ros.errors import KfvoError, reason_of
+from kfvo_ros.errors import KfvoError
 from kfvo_ros.keyframes.observation import Layout
 from kfvo_ros.keyframes.rail import Rail
 from kfvo_ros.learning.augmentation import Augmentation
@@ -17,6 +15,7 @@ from kfvo_ros.learning.strict import from_mapping, key
 from kfvo_ros.learning.teacher import Teacher
 from kfvo_ros.options import REWARDS
 from kfvo_ros.scale import SCALE_RULES
+from kfvo_ros.yaml_file import read_yaml
 
 IMAGE_PARTS, SIGNALS = ('descriptor', 'poses'), 'signals'
 """The parts of an observation that there always are; the others are a backbone's signals."""
@@ -39,6 +38,20 @@ class Ppo:
 
 
 @dataclass(frozen=True)
+class Imitation:
+    """How the teacher is imitated: so many ``steps`` of each environment, in ``passes`` of Adam.
+
+    ``certainty`` is how sure of the teacher's decisions the pupil becomes.
+    """
+
+    steps: int = key(least=1)
+    passes: int = key(least=1)
+    batch_size: int = key(least=1)
+    learning_rate: float = key(least=0.0, most=1.0)
+    certainty: float = key(least=0.5, most=1.0)
+
+
+@dataclass(frozen=True)
 class LearningRate:
     """Adam's, on a line from the first step to the last."""
 
@@ -55,8 +68,9 @@ class Recipe:
     """A training, after so many ``steps``: decisions in all environments together.
 
     ``span`` is the local reward's, ``scale`` None the backbone's own rule, ``teacher`` who is
-    imitated first, None for nobody; ``rail`` None is no rail;
-    ``without`` names parts of the observation that the policy does not see (`unseen`).
+    imitated first, and ``imitation`` how, None for nobody; ``rail`` None is no rail; ``without``
+    names parts of the observation that the policy does not see (`unseen`); ``width`` is that of
+    the networks.
     """
 
     steps: int = key(least=1)
@@ -68,6 +82,7 @@ class Recipe:
     scale: str | None = key(choices=SCALE_RULES)
     teacher: Teacher | None = key(within={'flow': (0.0, 1e3), 'baseline': (0.0, 1e3),
                                           'survival': (0.0, 1.0)})
+    imitation: Imitation | None = key()
     rail: Rail | None = key(within={'min_survival': (0.0, 1.0), 'max_gap': (1, None),
                                     'min_flow': (0.0, 1e3)})
     without: tuple[str, ...] = key()
@@ -77,6 +92,7 @@ class Recipe:
         'brightness': (0.0, 1.0), 'contrast': (0.0, 1.0), 'saturation': (0.0, 1.0),
         'calibration': (0.0, 0.1), 'drop_share': (0.0, 0.9), 'max_stride': (1, 20),
         'frames': (20, None)})
+    width: int = key(least=1, most=4096)
     ppo: Ppo = key()
     learning_rate: LearningRate = key()
 
@@ -90,12 +106,10 @@ class Recipe:
 def read_recipe(name: str) -> Recipe:
     """Return the recipe of a file, found as `find_config` does; raises KfvoError."""
     path = find_config(name)
-    try:
-        with path.open(encoding='utf-8') as file:
-            content = yaml.safe_load(file)
-    except (OSError, ValueError, yaml.YAMLError) as error:
-        raise KfvoError(f'cannot read the recipe {path}: {reason_of(error)}') from error
-    return from_mapping(Recipe, content, str(path))
+    recipe = from_mapping(Recipe, read_yaml(path, 'the recipe '), str(path))
+    if recipe.teacher is not None and recipe.imitation is None:
+        raise KfvoError(f'{path}: imitation: expected how the teacher is imitated; came None')
+    return recipe
 
 
 def unseen(without: tuple[str, ...], layout: Layout) -> tuple[str, ...]:

@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
 from kfvo_ros import assembly
 from kfvo_ros.backbones.base import Backbone
+from kfvo_ros.errors import KfvoError
 from kfvo_ros.keyframes.observation import Layout, indices_of
 from kfvo_ros.keyframes.rail import Rail
 from kfvo_ros.learning.archive import Archive
@@ -29,6 +30,8 @@ from kfvo_ros.tracking import FEATURES
 
 LEAST_LEFT = 150
 """An episode begins anywhere but in so many last frames of a drive."""
+MOST_UNASKED = 50
+"""So many episodes in a row without a decision, and no sequence left out, are enough."""
 
 Pupil = tuple[tuple[str, ...], np.random.SeedSequence]
 """One episode at a time: the sequences it takes turns in, and its dice."""
@@ -71,11 +74,11 @@ class Lesson:
                        {'seed': self.odometry.seed, 'tracks': self.tracks}, self.cache,
                        live=not backbone.offers_tracks)
 
-    def new_reward(self) -> Reward:
-        """Return the reward of one episode."""
+    def new_reward(self, frames: int) -> Reward:
+        """Return the reward of one episode of so many frames."""
         if self.reward == 'paper':
             return PaperReward(self.alpha)
-        return LocalReward(self.span, self.alpha)
+        return LocalReward(min(self.span, frames), self.alpha)
 
 
 class School:
@@ -95,15 +98,24 @@ class School:
 
     def _episodes(self, sequences: tuple[str, ...],
                   seed: np.random.SeedSequence) -> Iterator[Episode]:
-        """Yield episodes for ever: each sequence in turn, in a variant, from somewhere on."""
-        lesson, dice = self._lesson, np.random.default_rng(seed)
-        while True:
+        """Yield episodes for ever: each sequence in turn, in a variant, from somewhere on.
+
+        Raises KfvoError where they end again and again before there is anything to decide.
+        """
+        lesson, dice, unasked = self._lesson, np.random.default_rng(seed), 0
+        while unasked < max(MOST_UNASKED, len(sequences)):
             for text in dice.permutation(sequences):
                 drive = self._archive.variant(str(text), lesson.augmentation,
                                               int(dice.integers(lesson.variants)))
                 start = int(dice.integers(max(1, len(drive) - LEAST_LEFT)))
-                yield Episode(drive.since(start), self._backbone, self._present.scale_rule,
-                              self._present.window_size, lesson.rail, lesson.new_reward())
+                episode = Episode(drive.since(start), self._backbone, self._present.scale_rule,
+                                  self._present.window_size, lesson.rail,
+                                  lesson.new_reward(len(drive) - start))
+                yield episode
+                unasked = 0 if episode.asked else unasked + 1
+        raise KfvoError(f'{", ".join(sequences)}: expected decisions to learn from, there were '
+                        f'none in {unasked} episodes: the camera is lost or at rest, or the rail '
+                        'decides all')
 
 
 def make_environment(lesson: Lesson, environments: int, workers: int, seed: int) -> VecEnv:

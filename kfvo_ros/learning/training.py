@@ -48,24 +48,29 @@ class Training:
         self._references, self._about = references, about
         self.steps, self._best = 0, math.inf
         if checkpoint is not None:
-            self.steps, self._best = checkpoint.steps, checkpoint.best
+            self.steps = checkpoint.steps
+            if files.output.exists():  # else the best from now on, for there is no other
+                self._best = checkpoint.best
         self._saved_at = self.steps
         self.model = make_model(environment, plan.recipe, plan.seed_at(self.steps))
-        self.model.set_logger(Logger(str(files.folder),
-                                     [TensorBoardOutputFormat(str(files.folder))]))
         if checkpoint is not None:
             checkpoint.restore(self.model)
+        self.model.set_logger(Logger(str(files.folder),
+                                     [TensorBoardOutputFormat(str(files.folder))]))
         for name, score in references.items():
             self._log(name, score)
 
     def learn(self, witness: Witness) -> None:
         """Go through all steps that are left; raises what the witness does."""
-        teacher = self.plan.recipe.teacher
-        if teacher is not None and self.steps == 0:
-            imitate(self.model, self.plan.setting.observation, teacher,
-                    lambda: witness.stepped(0))
-        self.model.learn(max(self.plan.recipe.steps - self.steps, 0), _Rounds(self, witness),
-                         reset_num_timesteps=False)
+        teacher, imitation = self.plan.recipe.teacher, self.plan.recipe.imitation
+        try:
+            if teacher is not None and imitation is not None and self.steps == 0:
+                imitate(self.model, self.plan.setting.observation, teacher, imitation,
+                        lambda: witness.stepped(0))
+            self.model.learn(max(self.plan.recipe.steps - self.steps, 0), _Rounds(self, witness),
+                             reset_num_timesteps=False)
+        finally:
+            self.model.logger.close()  # a thread and a file
 
     def after_update(self, steps: int, is_last: bool, witness: Witness) -> None:
         """Take note that all `steps` were learned from; validate and save when it is time."""
@@ -106,6 +111,7 @@ class Training:
             plan.recipe.rail or NO_RAIL, plan.setting,
             {**self._about, 'sequences': plan.sequences, 'validation': plan.validation,
              'seed': plan.seed, 'steps': self.steps, 'recipe': asdict(plan.recipe),
+             'reading': asdict(plan.reading), 'vggt': plan.vggt and asdict(plan.vggt),
              'scores': {name: asdict(score) for name, score in (scores or {}).items()}})
 
     def _log(self, name: str, score: Score) -> None:
@@ -122,8 +128,10 @@ def make_model(environment: VecEnv, recipe: Recipe, seed: int) -> PPO:
     batch_size = min(ppo.pop('batch_size') or rollout, rollout)
     with warnings.catch_warnings():  # one batch of a rollout may be smaller
         warnings.filterwarnings('ignore', 'You have specified a mini-batch size')
-        return PPO(PrivilegedCritic, normalised, recipe.learning_rate.at, batch_size=batch_size,
-                   **ppo, seed=seed, device='cpu')
+        model = PPO(PrivilegedCritic, normalised, recipe.learning_rate.at, batch_size=batch_size,
+                    **ppo, seed=seed, device='cpu', policy_kwargs={'width': recipe.width})
+    model.set_logger(Logger(None, []))  # without one it would make a folder in /tmp
+    return model
 
 
 class _Rounds(BaseCallback):

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -14,18 +13,23 @@ import yaml
 from kfvo_ros.atomic import replaced
 from kfvo_ros.errors import KfvoError, reason_of
 from kfvo_ros.keyframes.policy_file import read_policy
+from kfvo_ros.learning.checkpoint import changes, read_checkpoint
 from kfvo_ros.learning.files import SUFFIX, TrainingFiles
-from kfvo_ros.learning.recipe import Recipe
+from kfvo_ros.learning.plan import Plan
 
 
 @dataclass(frozen=True)
 class Trial:
-    """The ``recipe`` of a ``row``, learned with a ``seed``, all in one folder."""
+    """The ``plan`` of a ``row`` and a seed, with all others in one folder."""
 
     row: str
-    seed: int
-    recipe: Recipe
+    plan: Plan
     folder: Path
+
+    @property
+    def seed(self) -> int:
+        """The training's."""
+        return self.plan.seed
 
     @property
     def files(self) -> TrainingFiles:
@@ -38,26 +42,37 @@ class Trial:
         return self.folder / f'{self.row}.yaml'
 
     def prepare(self, resume: bool) -> None:
-        """Write the recipe; raises KfvoError at an earlier training that is not to `resume`."""
+        """Make the folder; raises KfvoError at an earlier training, or to `resume` another one."""
         earlier = [path for path in (self.files.output, self.files.folder) if path.exists()]
         if earlier and not resume:
             raise KfvoError(f'{earlier[0]} is there already; choose another --output, or add '
                             '--resume to go on')
+        if not self.is_complete():
+            if self.files.checkpoint.exists():
+                read_checkpoint(self.files.checkpoint, self.plan)
+            elif self.files.output.exists():
+                raise KfvoError(f'{self.files.output} is of another training, or has lost its '
+                                'checkpoint; choose another --output, or remove it')
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise KfvoError(f'cannot write to {self.folder}: {reason_of(error)}') from error
+
+    def write_recipe(self) -> None:
+        """Write the recipe of a training that begins or goes on; raises KfvoError."""
+        try:
             with replaced(self.recipe_file) as draft:
-                draft.write_text(yaml.safe_dump(asdict(self.recipe), sort_keys=False),
+                draft.write_text(yaml.safe_dump(asdict(self.plan.recipe), sort_keys=False),
                                  encoding='utf-8')
         except OSError as error:
             raise KfvoError(f'cannot write to {self.folder}: {reason_of(error)}') from error
 
-    def is_complete(self, sequences: Sequence[str], validation: Sequence[str]) -> bool:
+    def is_complete(self) -> bool:
         """Whether all that was learned already, for as many steps; raises KfvoError."""
         if not (self.files.output.exists() and self.files.last.exists()):
             return False
+        wanted = json.loads(json.dumps(asdict(self.plan)))
         told = read_policy(self.files.last).training
-        wanted = {'recipe': asdict(self.recipe), 'seed': self.seed, 'sequences': sequences,
-                  'validation': validation}
-        return (told.get('steps', 0) >= self.recipe.steps
-                and all(told.get(name) == value
-                        for name, value in json.loads(json.dumps(wanted)).items()))
+        return (told.get('steps', 0) >= self.plan.recipe.steps
+                and not any(changes({name: value for name, value in told.items()
+                                     if name in wanted}, wanted)))
