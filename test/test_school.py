@@ -56,9 +56,9 @@ def run(lesson: Lesson, workers: int, seed: int = 0, steps: int = 40):
     environment = make_environment(lesson, 3, workers, seed)
     try:
         told = [environment.reset()[OBSERVATION]]
-        earned, dice = [], np.random.default_rng(0)
+        earned, rng = [], np.random.default_rng(0)
         for _ in range(steps):
-            observations, rewards, _, _ = environment.step(dice.integers(0, 2, 3))
+            observations, rewards, _, _ = environment.step(rng.integers(0, 2, 3))
             told.append(observations[OBSERVATION])
             earned.append(rewards)
         assert observations[PRIVILEGED].shape[0] == environment.num_envs == 3

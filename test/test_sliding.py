@@ -16,13 +16,13 @@ SHAPE = (240, 320)
 
 def two_layers(seed: int, count: int, near: float, far: float) -> list[np.ndarray]:
     """Return images of round near things before something far, by so many px per frame."""
-    dice, (height, width), margin = np.random.default_rng(seed), SHAPE, 80
-    back, front = (cv2.GaussianBlur(dice.random((height, width + margin), dtype=np.float32),
+    rng, (height, width), margin = np.random.default_rng(seed), SHAPE, 80
+    back, front = (cv2.GaussianBlur(rng.random((height, width + margin), dtype=np.float32),
                                     (0, 0), 1.5) for _ in range(2))
     back, front = (cv2.normalize(each, None, *reach, cv2.NORM_MINMAX)
                    for each, reach in ((back, (20.0, 200.0)), (front, (60.0, 250.0))))
     cover = np.zeros_like(back)
-    for x, y in dice.uniform((0, 0), (width + margin, height), (30, 2)):
+    for x, y in rng.uniform((0, 0), (width + margin, height), (30, 2)):
         cv2.circle(cover, (int(x), int(y)), 12, 1.0, -1)
     cover = cv2.GaussianBlur(cover, (0, 0), 0.7)
 

@@ -55,9 +55,9 @@ def test_twenty_sequences_take_one_encode_and_one_estimate_per_step(tmp_path):
              'estimate': small_model().camera_head}
     hooks = [part.register_forward_hook(counted(name)) for name, part in parts.items()]
     try:
-        dice = np.random.default_rng(0)
+        rng = np.random.default_rng(0)
         for step in range(1, FRAMES - 8 + 1):
-            _, rewards, dones, _ = environment.step(dice.integers(0, 2, ENVIRONMENTS))
+            _, rewards, dones, _ = environment.step(rng.integers(0, 2, ENVIRONMENTS))
             assert not dones.any() and np.isfinite(rewards).all()
             assert calls == {'encode': step, 'estimate': step}
     finally:

@@ -43,28 +43,28 @@ class Variant(Sequence):
                  stop: int | None = None) -> None:
         self._sequence, self._frames, self._stop = sequence, augmentation.frames, stop
         self._rng_seed = (number, zlib.crc32(sequence.name.encode()))
-        dice = np.random.default_rng(self._rng_seed)
+        rng = np.random.default_rng(self._rng_seed)
         self.name = f'{sequence.name} variant {number}'
         self.camera = sequence.camera and sequence.camera.miscalibrated(
             *np.random.default_rng((*self._rng_seed, 2)).uniform(
                 -augmentation.calibration, augmentation.calibration, 2))
-        self._factors = [dice.uniform(1.0 - reach, 1.0 + reach) for reach in (
+        self._factors = [rng.uniform(1.0 - reach, 1.0 + reach) for reach in (
             augmentation.brightness, augmentation.contrast, augmentation.saturation)]
-        self._drop_share = dice.uniform(0.0, augmentation.drop_share)
-        self._stride = int(dice.integers(1, augmentation.max_stride, endpoint=True))
+        self._drop_share = rng.uniform(0.0, augmentation.drop_share)
+        self._stride = int(rng.integers(1, augmentation.max_stride, endpoint=True))
         length = sequence.length or 0 if stop is None else min(stop, sequence.length or stop)
         spare = length - augmentation.frames * self._stride
-        self._start = int(dice.integers(0, max(spare, 0), endpoint=True))
+        self._start = int(rng.integers(0, max(spare, 0), endpoint=True))
         # What a rolling shutter did cannot be read backwards.
         rolling = sequence.camera is not None and sequence.camera.readout_s > 0.0
-        self._backwards = augmentation.reversal and not rolling and bool(dice.integers(2))
+        self._backwards = augmentation.reversal and not rolling and bool(rng.integers(2))
 
     def __iter__(self) -> Iterator[Frame]:
         """Yield the frames; of a variant that runs backwards all images are held."""
-        dice = np.random.default_rng((*self._rng_seed, 1))
+        rng = np.random.default_rng((*self._rng_seed, 1))
         seen = islice(self._sequence, self._start, self._stop, self._stride)
         frames: Iterator[Frame] = islice(
-            (frame for frame in seen if dice.random() >= self._drop_share), self._frames)
+            (frame for frame in seen if rng.random() >= self._drop_share), self._frames)
         if self._backwards:
             mirror = self._mirror_ns()
             frames = (replace(frame, stamp_ns=mirror - frame.stamp_ns)

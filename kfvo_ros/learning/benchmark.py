@@ -135,10 +135,10 @@ def frames_per_decision(lesson: Lesson) -> float:
     backbone = CountingBackbone(lesson.odometry.seed, lesson.tracks)
     environment = make_environment(CountedLesson(**vars(lesson), counting=backbone), 1, 1, 0)
     environment.reset()
-    dice, steps = np.random.default_rng(0), 0
+    rng, steps = np.random.default_rng(0), 0
     begun: list[tuple[int, int]] = []  # frames and steps where an episode was over
     while len(begun) <= len(lesson.sequences):
-        _, _, dones, _ = environment.step(dice.integers(2, size=1))
+        _, _, dones, _ = environment.step(rng.integers(2, size=1))
         steps += 1
         if dones[0]:
             begun.append((backbone.frames, steps))
@@ -174,9 +174,9 @@ def _rate(seconds: float, work: Callable[[float], int]) -> float:
 
 def _drive(environment: VecEnv, go_on: Callable[[int], bool]) -> int:
     """Decide at random while told to go on; return the steps of each environment."""
-    dice, steps = np.random.default_rng(0), 0
+    rng, steps = np.random.default_rng(0), 0
     while go_on(steps):
-        environment.step(dice.integers(2, size=environment.num_envs))
+        environment.step(rng.integers(2, size=environment.num_envs))
         steps += 1
     return steps
 

@@ -20,7 +20,7 @@ from kfvo_ros.learning.references import references
 from kfvo_ros.learning.validation import Validation, ate_percent
 from kfvo_ros.options import OdometryOptions
 
-DICE = (0, 1, 2)
+SEEDS = (0, 1, 2)
 """Seeds of the random policy."""
 
 
@@ -51,7 +51,7 @@ class Examination:
         rail = recipe.rail or NO_RAIL
         for name, policy in references(recipe, self.options, self.backbone).items():
             yield from self.outcomes(name, None, policy)
-        for seed in DICE:
+        for seed in SEEDS:
             yield from self.outcomes(Random.name, seed, Random(rail, seed))
         if recipe.rail is not None:
             yield from self.outcomes(RailAlone.name, None, RailAlone(rail))

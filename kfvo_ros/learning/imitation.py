@@ -35,9 +35,9 @@ def imitate(model: PPO, layout: Layout, teacher: Teacher, how: Imitation,
     seen, kept, returns = _watch(environment, layout, teacher, how.steps, model.gamma,
                                  before_each)
     optimiser = torch.optim.Adam(policy.parameters(), how.learning_rate)
-    dice = torch.Generator().manual_seed(model.seed or 0)
+    rng = torch.Generator().manual_seed(model.seed or 0)
     for _ in range(how.passes):
-        for rows in torch.randperm(len(kept), generator=dice).split(how.batch_size):
+        for rows in torch.randperm(len(kept), generator=rng).split(how.batch_size):
             batch = {name: values[rows] for name, values in seen.items()}
             values, right, _ = policy.evaluate_actions(batch, kept[rows])
             wrong = torch.log1p(-right.exp().clamp(max=1.0 - 1e-6))

@@ -34,12 +34,12 @@ class Random(KeyframePolicy):
     def __init__(self, rail: Rail, seed: int) -> None:
         self._rail = rail
         self.needs_tracks = rail.needs_tracks
-        self._dice = np.random.default_rng(seed)
+        self._rng = np.random.default_rng(seed)
 
     def decide(self, decision: DecisionInput) -> bool:
-        """Ask the rail, then the dice."""
+        """Ask the rail, then chance."""
         forced = self._rail.forced(decision)
-        return forced if forced is not None else bool(self._dice.integers(2))
+        return forced if forced is not None else bool(self._rng.integers(2))
 
 
 class Taught(KeyframePolicy):

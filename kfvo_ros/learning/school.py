@@ -34,7 +34,7 @@ MOST_UNASKED = 50
 """So many episodes in a row without a decision, and no sequence left out, are enough."""
 
 Pupil = tuple[tuple[str, ...], np.random.SeedSequence]
-"""One episode at a time: the sequences it takes turns in, and its dice."""
+"""One episode at a time: the sequences it takes turns in, and its seed."""
 
 
 @dataclass(frozen=True)
@@ -102,12 +102,12 @@ class School:
 
         Raises KfvoError where they end again and again before there is anything to decide.
         """
-        lesson, dice, unasked = self._lesson, np.random.default_rng(seed), 0
+        lesson, rng, unasked = self._lesson, np.random.default_rng(seed), 0
         while unasked < max(MOST_UNASKED, len(sequences)):
-            for text in dice.permutation(sequences):
+            for text in rng.permutation(sequences):
                 drive = self._archive.variant(str(text), lesson.augmentation,
-                                              int(dice.integers(lesson.variants)))
-                start = int(dice.integers(max(1, len(drive) - LEAST_LEFT)))
+                                              int(rng.integers(lesson.variants)))
+                start = int(rng.integers(max(1, len(drive) - LEAST_LEFT)))
                 episode = Episode(drive.since(start), self._backbone, self._present.scale_rule,
                                   self._present.window_size, lesson.rail,
                                   lesson.new_reward(len(drive) - start))

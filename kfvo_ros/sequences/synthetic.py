@@ -87,36 +87,36 @@ class SyntheticSequence(Sequence):
 
     @cached_property
     def _poses(self) -> np.ndarray:
-        poses = move(self._dice('motion'), self._temper, self._path)
+        poses = move(self._rng('motion'), self._temper, self._path)
         return np.stack(list(islice(poses, self._length)))
 
     @cached_property
     def _scene(self) -> Scene:
         if self._temper == 'street':
-            return build_street(self._dice('scene'), self._path)
-        return build_scene(self._dice('scene'), self._temper, self._room_size,
+            return build_street(self._rng('scene'), self._path)
+        return build_scene(self._rng('scene'), self._temper, self._room_size,
                            self._path.positions(600))
 
     @cached_property
     def _gain(self) -> Waves:
-        return Waves(self._dice('gain'), rate_of(self._temper), *GAIN_BANDS)
+        return Waves(self._rng('gain'), rate_of(self._temper), *GAIN_BANDS)
 
     @property
     def _path(self) -> Path:
-        dice = self._dice('path')
+        rng = self._rng('path')
         if self._temper == 'street':
-            return around_block(dice)
-        return around_room(dice, self._room_size)
+            return around_block(rng)
+        return around_room(rng, self._room_size)
 
     @property
     def _room_size(self) -> tuple[float, float, float]:
-        dice = self._dice('room')
-        return dice.between(6.5, 9.5), dice.between(6.0, 8.0), dice.between(2.6, 3.2)
+        rng = self._rng('room')
+        return rng.between(6.5, 9.5), rng.between(6.0, 8.0), rng.between(2.6, 3.2)
 
     def _stamp_ns(self, index: int) -> int:
         return START_NS + index * NANOSECONDS // rate_of(self._temper)
 
-    def _dice(self, purpose: str) -> Dice:
+    def _rng(self, purpose: str) -> Dice:
         purposes = ('room', 'path', 'motion', 'scene', 'gain')
         return Dice(self._seed, STYLES.index(self._style), purposes.index(purpose))
 

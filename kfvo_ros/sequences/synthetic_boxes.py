@@ -25,8 +25,8 @@ SHADES_INSIDE = (0.95, 0.88, 0.92, 1.00, 0.90, 1.00)
 class BoxCollector:
     """Collects upright boxes, the room or the world first, and the textures that they wear."""
 
-    def __init__(self, dice: Dice, texels_per_metre: float = TEXELS_PER_METRE) -> None:
-        self._dice, self._texels_per_metre = dice, texels_per_metre
+    def __init__(self, rng: Dice, texels_per_metre: float = TEXELS_PER_METRE) -> None:
+        self._rng, self._texels_per_metre = rng, texels_per_metre
         self._turns: list[Turn] = []
         self._centres: list[Size] = []
         self._halves: list[Size] = []
@@ -35,7 +35,7 @@ class BoxCollector:
 
     def texture(self, painter: Callable[[Dice], np.ndarray]) -> int:
         """Paint a new texture and return its number."""
-        self._pyramids.append(build_pyramid(painter(self._dice)))
+        self._pyramids.append(build_pyramid(painter(self._rng)))
         return len(self._pyramids) - 1
 
     def add(self, texture: int, centre: Size, size: Size, turn: Turn = (1.0, 0.0),
@@ -52,7 +52,7 @@ class BoxCollector:
                 face[scale] = (TEXTURE_SIZE / size[axis] if fitted
                                else self._texels_per_metre)
                 face[offset] = (0.5 * TEXTURE_SIZE if fitted
-                                else self._dice.integer(0, TEXTURE_SIZE))
+                                else self._rng.integer(0, TEXTURE_SIZE))
             self.paint(len(self._faces) - 1, side, texture, contrast, tone)
 
     def paint(self, box: int, side: int, texture: int, contrast: float, tone: float) -> None:

@@ -74,13 +74,13 @@ Targets = tuple[float, float, float, float]
 """Speed [m/s], and the yaw from the path, pitch and roll [rad]."""
 
 
-def move(dice: Dice, temper: str, path: Path) -> Iterator[np.ndarray]:
+def move(rng: Dice, temper: str, path: Path) -> Iterator[np.ndarray]:
     """Yield T_world_camera (4, 4), frame by frame, without end."""
     rate = rate_of(temper)
-    trembles = [Waves(dice, rate, *TREMBLE_BANDS) for _ in range(6)]
-    place = dice.between(0.0, len(path))
+    trembles = [Waves(rng, rate, *TREMBLE_BANDS) for _ in range(6)]
+    place = rng.between(0.0, len(path))
     followers: list[Follower] = []
-    for frame, (targets, responses) in enumerate(_plan(dice, temper)):
+    for frame, (targets, responses) in enumerate(_plan(rng, temper)):
         followers = followers or [Follower(target) for target in targets]
         speed, yaw, pitch, roll = (follower.value for follower in followers)
         position, derivative = path.at(place)
@@ -98,26 +98,26 @@ def rate_of(temper: str) -> int:
     return RATES.get(temper, RATE)
 
 
-def _plan(dice: Dice, temper: str) -> Iterator[tuple[Targets, Targets]]:
+def _plan(rng: Dice, temper: str) -> Iterator[tuple[Targets, Targets]]:
     """Yield, per frame, what to aim at and the share of the way to it that a stage covers."""
     yaw = pitch = roll = 0.0
     groups = list(DECKS[temper][:1])
     while True:
         for activity in (activity for group in groups for activity in group):
-            speed, gaze = dice.between(*activity.speed), math.radians(
-                dice.between(*activity.gaze))
-            if yaw > 0.0 if activity.swings else dice.chance(0.5):
+            speed, gaze = rng.between(*activity.speed), math.radians(
+                rng.between(*activity.gaze))
+            if yaw > 0.0 if activity.swings else rng.chance(0.5):
                 gaze = -gaze
             if activity.turns:
                 yaw += -gaze if abs(yaw + gaze) > MAX_GAZE else gaze
             else:
                 yaw = gaze
-                pitch, roll = (math.radians(dice.between(*limits)) for limits in (PITCHES, ROLLS))
+                pitch, roll = (math.radians(rng.between(*limits)) for limits in (PITCHES, ROLLS))
             gazing = activity.response
             responses = activity.pace, gazing, gazing, gazing
-            for _ in range(round(rate_of(temper) * dice.between(*activity.seconds))):
+            for _ in range(round(rate_of(temper) * rng.between(*activity.seconds))):
                 yield (speed, yaw, pitch, roll), responses
-        groups = dice.shuffled(DECKS[temper])
+        groups = rng.shuffled(DECKS[temper])
 
 
 class Follower:
@@ -140,9 +140,9 @@ class Follower:
 class Waves:
     """A sum of sines of amplitude one, one in each band [Hz]."""
 
-    def __init__(self, dice: Dice, rate: float, *bands: tuple[float, float]) -> None:
-        self._waves = [(2.0 * math.pi * dice.between(*band) / rate,
-                        dice.between(0.0, 2.0 * math.pi)) for band in bands]
+    def __init__(self, rng: Dice, rate: float, *bands: tuple[float, float]) -> None:
+        self._waves = [(2.0 * math.pi * rng.between(*band) / rate,
+                        rng.between(0.0, 2.0 * math.pi)) for band in bands]
 
     def at(self, frame: int) -> float:
         """Return the sum at a frame."""

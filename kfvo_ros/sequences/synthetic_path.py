@@ -60,31 +60,31 @@ class Path:
         return np.array([self.at(len(self) * step / count)[0] for step in range(count)])
 
 
-def around_room(dice: Dice, size: tuple[float, float, float]) -> Path:
+def around_room(rng: Dice, size: tuple[float, float, float]) -> Path:
     """Return a loop in a room of `size` [m]; the origin is in the middle of its floor."""
     reach_x, reach_y = 0.5 * size[0] - MARGIN, 0.5 * size[1] - MARGIN
-    step = (1.0 if dice.chance(0.5) else -1.0) * 2.0 * math.pi / KNOTS
-    start = dice.between(0.0, KNOTS)
+    step = (1.0 if rng.chance(0.5) else -1.0) * 2.0 * math.pi / KNOTS
+    start = rng.between(0.0, KNOTS)
     knots = []
     for knot in range(KNOTS):
-        angle = step * (start + knot + dice.between(-0.15, 0.15))
-        radius = dice.between(0.7, 1.0)
+        angle = step * (start + knot + rng.between(-0.15, 0.15))
+        radius = rng.between(0.7, 1.0)
         knots.append((rounded(reach_x * radius * math.cos(angle)),
-                      rounded(reach_y * radius * math.sin(angle)), dice.between(*HEIGHTS)))
+                      rounded(reach_y * radius * math.sin(angle)), rng.between(*HEIGHTS)))
     return Path(knots)
 
 
-def around_block(dice: Dice) -> Path:
+def around_block(rng: Dice) -> Path:
     """Return a road around a block with the shape of an L, the origin in the middle of it.
 
     Five of its corners turn one way and one the other, all cut by the spline; between them it
     winds a little.
     """
-    wide, deep = dice.between(90.0, 140.0), dice.between(90.0, 140.0)
-    inner_x, inner_y = wide * dice.between(0.35, 0.65), deep * dice.between(0.35, 0.65)
+    wide, deep = rng.between(90.0, 140.0), rng.between(90.0, 140.0)
+    inner_x, inner_y = wide * rng.between(0.35, 0.65), deep * rng.between(0.35, 0.65)
     corners = [(0.0, 0.0), (wide, 0.0), (wide, inner_y), (inner_x, inner_y), (inner_x, deep),
                (0.0, deep)]
-    if dice.chance(0.5):
+    if rng.chance(0.5):
         corners.reverse()
     knots = []
     for start, end in zip(corners, corners[1:] + corners[:1], strict=True):
@@ -92,7 +92,7 @@ def around_block(dice: Dice) -> Path:
         length = abs(along[0]) + abs(along[1])
         pieces = round(length / SPACING)
         for piece in range(1, pieces):
-            share, off = piece / pieces, dice.between(-BEND, BEND) / length
+            share, off = piece / pieces, rng.between(-BEND, BEND) / length
             knots.append((rounded(start[0] + share * along[0] - off * along[1] - 0.5 * wide),
                           rounded(start[1] + share * along[1] + off * along[0] - 0.5 * deep),
                           MOUNTED))

@@ -49,20 +49,20 @@ class Dice:
         return [items[place] for place in np.argsort(self.unit(len(items)), kind='stable')]
 
 
-def noise(dice: Dice, rows: int, columns: int) -> np.ndarray:
+def noise(rng: Dice, rows: int, columns: int) -> np.ndarray:
     """Return smooth noise (SIZE, SIZE) in [-1, 1] through rows x columns values, periodic."""
-    lattice = 2.0 * dice.unit(rows, columns) - 1.0
+    lattice = 2.0 * rng.unit(rows, columns) - 1.0
     before, after, share = _blend(rows)
     lines = lattice[before] * (1.0 - share[:, None]) + lattice[after] * share[:, None]
     before, after, share = _blend(columns)
     return lines[:, before] * (1.0 - share) + lines[:, after] * share
 
 
-def fractal(dice: Dice, coarsest: int, finest: int, decay: float) -> np.ndarray:
+def fractal(rng: Dice, coarsest: int, finest: int, decay: float) -> np.ndarray:
     """Return the sum (SIZE, SIZE) of noise of `coarsest` to `finest` cells, doubling."""
     total, weight, cells = np.zeros((SIZE, SIZE)), 1.0, coarsest
     while cells <= finest:
-        total += weight * noise(dice, cells, cells)
+        total += weight * noise(rng, cells, cells)
         weight, cells = weight * decay, cells * 2
     return total
 

@@ -23,9 +23,9 @@ LANE, ROAD = 2.4, 4.3
 """Parked cars and crowns of trees keep so far from the camera's path, and all else [m]."""
 
 
-def build_street(dice: Dice, path: Path) -> Scene:
+def build_street(rng: Dice, path: Path) -> Scene:
     """Return what stands along a road."""
-    street = _Street(dice, path)
+    street = _Street(rng, path)
     street.lay_ground()
     for side in (-1.0, 1.0):
         street.build_houses(side)
@@ -36,9 +36,9 @@ def build_street(dice: Dice, path: Path) -> Scene:
 class _Street:
     """Places things beside the road, at a place on it and so far to its left."""
 
-    def __init__(self, dice: Dice, path: Path) -> None:
-        self.boxes = BoxCollector(dice, TEXELS_PER_METRE)
-        self._dice, self._path = dice, path
+    def __init__(self, rng: Dice, path: Path) -> None:
+        self.boxes = BoxCollector(rng, TEXELS_PER_METRE)
+        self._rng, self._path = rng, path
         self._road = path.positions(60 * len(path)) * (1.0, 1.0, 0.0)
         steps = self._road[1:] - self._road[:-1]
         # Added up exactly: elsewhere the last digit of a sum depends on its order.
@@ -53,49 +53,49 @@ class _Street:
 
     def lay_ground(self) -> None:
         """Put the road under the sky."""
-        boxes, dice = self.boxes, self._dice
+        boxes, rng = self.boxes, self._rng
         boxes.add(self._pick('plain'), (0.0, 0.0, 0.5 * WORLD[2]), WORLD)
         for wall in range(4):
             boxes.paint(0, wall, self._pick('leaves'), 0.2 * DAYLIGHT, 60.0)
-        boxes.paint(0, 4, self._pick('stone'), dice.between(0.35, 0.7) * DAYLIGHT,
-                    dice.between(20.0, 60.0))
+        boxes.paint(0, 4, self._pick('stone'), rng.between(0.35, 0.7) * DAYLIGHT,
+                    rng.between(20.0, 60.0))
         boxes.paint(0, 5, self._pick('plain'), 0.0, 160.0)
 
     def build_houses(self, side: float) -> None:
         """Put houses, or a fence where there is none, all along one side."""
-        dice, along = self._dice, 0.0
+        rng, along = self._rng, 0.0
         while along < self._length:
-            wide, back = dice.between(7.0, 14.0), dice.between(8.0, 13.0)
-            if dice.chance(0.75):
-                deep = dice.between(6.0, 9.0)
+            wide, back = rng.between(7.0, 14.0), rng.between(8.0, 13.0)
+            if rng.chance(0.75):
+                deep = rng.between(6.0, 9.0)
                 self._stand('facade', along, side * (back + 0.5 * deep),
-                            (wide, deep, dice.between(4.0, 10.0)), fitted=True)
-            if dice.chance(0.5):
-                self._stand(dice.choice(['leaves', 'brick', 'stone']), along, side * 6.5,
-                            (wide, 0.5, dice.between(0.6, 1.6)))
-            along += wide + dice.between(0.5, 5.0)
+                            (wide, deep, rng.between(4.0, 10.0)), fitted=True)
+            if rng.chance(0.5):
+                self._stand(rng.choice(['leaves', 'brick', 'stone']), along, side * 6.5,
+                            (wide, 0.5, rng.between(0.6, 1.6)))
+            along += wide + rng.between(0.5, 5.0)
 
     def line_road(self, side: float) -> None:
         """Put a pavement along one side, and cars, trees, posts and boxes on it."""
-        dice, along = self._dice, 0.0
+        rng, along = self._rng, 0.0
         while along < self._length:
             self._stand('paving', along, side * 5.6, (7.5, 1.8, 0.24), -0.12)
-            kind = dice.integer(0, 6)
+            kind = rng.integer(0, 6)
             if kind < 2:
-                self._park(along, side * dice.between(3.5, 3.9))
+                self._park(along, side * rng.between(3.5, 3.9))
             elif kind == 2:
-                self._plant(along, side * dice.between(5.2, 6.2))
+                self._plant(along, side * rng.between(5.2, 6.2))
             elif kind == 3:
-                self._stand('stone', along, side * 5.0, (0.16, 0.16, dice.between(4.0, 6.0)))
+                self._stand('stone', along, side * 5.0, (0.16, 0.16, rng.between(4.0, 6.0)))
             elif kind == 4:
-                self._stand('sign', along, side * 5.6, (0.3, 1.0, 1.4), dice.between(0.3, 1.5),
+                self._stand('sign', along, side * 5.6, (0.3, 1.0, 1.4), rng.between(0.3, 1.5),
                             fitted=True)
-            along += dice.between(5.0, 8.0)
+            along += rng.between(5.0, 8.0)
 
     def _park(self, along: float, left: float) -> None:
         """Park a car: a body and a cabin."""
-        dice = self._dice
-        length, tone = dice.between(3.8, 4.8), dice.between(-60.0, 60.0)
+        rng = self._rng
+        length, tone = rng.between(3.8, 4.8), rng.between(-60.0, 60.0)
         if self._stand('car', along, left, (length, 1.75, 0.65), 0.25, tone=tone, fitted=True,
                        clearance=LANE):
             self._stand('glass', along, left, (0.55 * length, 1.5, 0.55), 0.9, fitted=True,
@@ -103,10 +103,10 @@ class _Street:
 
     def _plant(self, along: float, left: float) -> None:
         """Plant a tree: a trunk and a crown."""
-        dice = self._dice
-        side, trunk = dice.between(1.5, 3.0), dice.between(1.8, 3.0)
+        rng = self._rng
+        side, trunk = rng.between(1.5, 3.0), rng.between(1.8, 3.0)
         if self._stand('stone', along, left, (0.25, 0.25, trunk), tone=-50.0):
-            self._stand('leaves', along, left, (side, side, dice.between(1.5, 3.0)), trunk,
+            self._stand('leaves', along, left, (side, side, rng.between(1.5, 3.0)), trunk,
                         clearance=LANE)
 
     def _stand(self, texture: str, along: float, left: float, size: Size, bottom: float = 0.0,
@@ -126,4 +126,4 @@ class _Street:
 
     def _pick(self, texture: str) -> int:
         """Return the number of a texture of that name."""
-        return self._dice.choice(self._textures[texture])
+        return self._rng.choice(self._textures[texture])

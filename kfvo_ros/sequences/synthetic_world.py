@@ -41,22 +41,22 @@ WALL_THINGS = (
     Thing('cupboard', (0.7, 1.2), (0.0, 0.0), (1.2, 1.9), 0.45))
 
 
-def build_scene(dice: Dice, temper: str, size: Size, path: np.ndarray) -> Scene:
+def build_scene(rng: Dice, temper: str, size: Size, path: np.ndarray) -> Scene:
     """Return a room of `size` [m], its floor around the origin, furnished beside a path (N, 3)."""
-    room = _Room(dice, size, path)
+    room = _Room(rng, size, path)
     room.surface(PLAIN_WALLS[temper])
     room.furnish_walls()
     room.furnish_floor(ATTEMPTS[temper])
-    lamp = dice.between(-1.0, 1.0), dice.between(-1.0, 1.0), size[2] - 0.6
+    lamp = rng.between(-1.0, 1.0), rng.between(-1.0, 1.0), size[2] - 0.6
     return room.boxes.build(lamp)
 
 
 class _Room:
     """Places things; walls are numbered like the sides of a box: -x +x -y +y."""
 
-    def __init__(self, dice: Dice, size: Size, path: np.ndarray) -> None:
-        self.boxes = BoxCollector(dice)
-        self._dice, self._size, self._path = dice, size, path
+    def __init__(self, rng: Dice, size: Size, path: np.ndarray) -> None:
+        self.boxes = BoxCollector(rng)
+        self._rng, self._size, self._path = rng, size, path
         self._plain: list[int] = []
         painters = {'print': [textures.poster] * 4, 'books': [textures.books],
                     'door': [textures.door], 'window': [textures.window],
@@ -67,17 +67,17 @@ class _Room:
 
     def surface(self, plain_walls: int) -> None:
         """Paint the walls, `plain_walls` of them plain, the floor and a ceiling with lamps."""
-        dice, boxes = self._dice, self.boxes
+        rng, boxes = self._rng, self.boxes
         plaster, panels = boxes.texture(textures.plaster), boxes.texture(textures.panels)
-        rough = boxes.texture(dice.choice([textures.brick, textures.concrete,
-                                           textures.wallpaper]))
-        floor = boxes.texture(dice.choice([textures.planks, textures.tiles, textures.carpet]))
+        rough = boxes.texture(rng.choice([textures.brick, textures.concrete,
+                                          textures.wallpaper]))
+        floor = boxes.texture(rng.choice([textures.planks, textures.tiles, textures.carpet]))
         boxes.add(plaster, (0.0, 0.0, 0.5 * self._size[2]), self._size)
         plain = [(panels, 0.5, 40.0), (plaster, 0.22, 45.0), (panels, 0.5, 30.0),
                  (plaster, 0.22, 20.0)]
         lively = [(rough, 0.6, 10.0), (plaster, 0.25, 40.0), (panels, 0.6, 20.0),
                   (plaster, 0.25, 25.0)]
-        walls = dice.shuffled(range(4))
+        walls = rng.shuffled(range(4))
         self._plain = walls[:plain_walls]
         for wall, look in zip(walls, plain[:plain_walls] + lively, strict=False):
             boxes.paint(0, wall, *look)
@@ -90,22 +90,22 @@ class _Room:
 
     def furnish_walls(self) -> None:
         """Go along every wall and put something everywhere but on the plain ones."""
-        dice = self._dice
+        rng = self._rng
         for wall in range(4):
             length = self._size[1] if wall < 2 else self._size[0]
             self._mount('wood', wall, 0.0, (length - 0.02, 0.08, 0.02), 0.0, tone=-50.0)
-            along = -0.5 * length + dice.between(0.2, 0.8)
+            along = -0.5 * length + rng.between(0.2, 0.8)
             while along < 0.5 * length - 1.3 and wall not in self._plain:
-                thing = dice.choice(WALL_THINGS)
-                wide, bottom = dice.between(*thing.wide), dice.between(*thing.bottom)
+                thing = rng.choice(WALL_THINGS)
+                wide, bottom = rng.between(*thing.wide), rng.between(*thing.bottom)
                 middle = along + 0.5 * wide
                 self._mount(thing.texture, wall, middle,
-                            (wide, dice.between(*thing.high), thing.deep), bottom, fitted=True)
+                            (wide, rng.between(*thing.high), thing.deep), bottom, fitted=True)
                 if bottom > 1.2:
                     self._mount(SIDEBOARD.texture, wall, middle,
-                                (wide, dice.between(*SIDEBOARD.high), SIDEBOARD.deep), 0.0,
+                                (wide, rng.between(*SIDEBOARD.high), SIDEBOARD.deep), 0.0,
                                 fitted=True)
-                along += wide + dice.between(0.2, 1.0)
+                along += wide + rng.between(0.2, 1.0)
 
     def _mount(self, texture: str, wall: int, along: float, size: Size, bottom: float,
                **look: Any) -> None:
@@ -120,29 +120,29 @@ class _Room:
 
     def furnish_floor(self, attempts: int) -> None:
         """Look for places for tables, parcels, pillars and screens."""
-        dice = self._dice
+        rng = self._rng
         for _ in range(attempts):
-            spot = (dice.between(-0.5, 0.5) * (self._size[0] - 1.0),
-                    dice.between(-0.5, 0.5) * (self._size[1] - 1.0))
+            spot = (rng.between(-0.5, 0.5) * (self._size[0] - 1.0),
+                    rng.between(-0.5, 0.5) * (self._size[1] - 1.0))
             # Rational points of the circle: a heading without sine and cosine.
-            t = dice.between(-1.0, 1.0)
+            t = rng.between(-1.0, 1.0)
             turn = (1.0 - t * t) / (1.0 + t * t), 2.0 * t / (1.0 + t * t)
-            kind = dice.integer(0, 4)
+            kind = rng.integer(0, 4)
             if kind == 0:
                 self._put_table(spot, turn)
             elif kind == 1:
                 self._put_parcels(spot, turn)
             elif kind == 2:
-                side = dice.between(0.2, 0.4)
+                side = rng.between(0.2, 0.4)
                 self._stand('wood', spot, (side, side, self._size[2]), 0.0, turn)
             else:
-                self._stand('print', spot, (dice.between(0.6, 1.1), 0.05, 1.7), 0.0, turn,
+                self._stand('print', spot, (rng.between(0.6, 1.1), 0.05, 1.7), 0.0, turn,
                             fitted=True)
 
     def _put_table(self, spot: tuple[float, float], turn: Turn) -> None:
         """Stand a table with three things on it."""
-        dice = self._dice
-        wide, deep = dice.between(1.0, 1.6), dice.between(0.6, 0.9)
+        rng = self._rng
+        wide, deep = rng.between(1.0, 1.6), rng.between(0.6, 0.9)
         if not self._stand('wood', spot, (wide, deep, 0.04), 0.72, turn, tone=30.0):
             return
         for side_x in (-0.45, 0.45):
@@ -150,18 +150,18 @@ class _Room:
                 self._stand('wood', _moved(spot, turn, side_x * wide, side_y * deep),
                             (0.06, 0.06, 0.72), 0.0, turn, tone=-30.0)
         for side in (-0.3, 0.0, 0.3):
-            place = _moved(spot, turn, side * wide, dice.between(-0.2, 0.2) * deep)
-            self._stand(dice.choice(['parcel', 'books', 'print']), place,
-                        (dice.between(0.15, 0.3), dice.between(0.1, 0.3),
-                         dice.between(0.1, 0.4)), 0.76, turn, fitted=True)
+            place = _moved(spot, turn, side * wide, rng.between(-0.2, 0.2) * deep)
+            self._stand(rng.choice(['parcel', 'books', 'print']), place,
+                        (rng.between(0.15, 0.3), rng.between(0.1, 0.3),
+                         rng.between(0.1, 0.4)), 0.76, turn, fitted=True)
 
     def _put_parcels(self, spot: tuple[float, float], turn: Turn) -> None:
         """Stack parcels as high as the path allows."""
-        side, bottom = self._dice.between(0.4, 0.7), 0.0
+        side, bottom = self._rng.between(0.4, 0.7), 0.0
         while side > 0.25 and self._stand('parcel', spot, (side, side, 0.8 * side), bottom, turn,
                                           fitted=True):
             bottom += 0.8 * side
-            side *= self._dice.between(0.5, 0.9)
+            side *= self._rng.between(0.5, 0.9)
 
     def _stand(self, texture: str, spot: tuple[float, float], size: Size, bottom: float,
                turn: Turn, **look: Any) -> bool:
@@ -174,7 +174,7 @@ class _Room:
 
     def _pick(self, texture: str) -> int:
         """Return the number of a texture of that name."""
-        return self._dice.choice(self._textures[texture])
+        return self._rng.choice(self._textures[texture])
 
 
 def _moved(spot: tuple[float, float], turn: Turn, ahead: float, left: float
