@@ -143,9 +143,9 @@ def _validation(plan: Plan, chosen: Choices, backbone: Backbone
         print('no validation: the last policy is the one that is kept; name sequences with '
               '--validation')
         return None, {}
-    archive = chosen.archive(backbone)
-    drives = [archive.whole(text)
-              for text in tqdm(plan.validation, unit='sequence', desc='validation')]
+    drives = chosen.archive(backbone).wholes(plan.validation)
+    for _ in tqdm(drives, unit='sequence', desc='validation'):
+        pass  # what cannot be read is told now, and what is tracked is kept
     validation = Validation(drives, backbone, assembly.setting_of(chosen.odometry, backbone))
     print(f'{f"{len(drives)} sequences":<26}{"ATE of path":>12}{"keyframes":>16}')
     scores = {}

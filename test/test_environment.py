@@ -14,7 +14,7 @@ import pytest
 pytest.importorskip('stable_baselines3', reason="stable-baselines3 is not installed: pip install "
                     "'.[train]'")
 
-from kfvo_ros import geometry
+from kfvo_ros import assembly, geometry
 from kfvo_ros.backbones.base import Status
 from kfvo_ros.backbones.geometric.backbone import GeometricBackbone
 from kfvo_ros.errors import KfvoError
@@ -25,7 +25,9 @@ from kfvo_ros.learning.drives import Drive, record
 from kfvo_ros.learning.environment import OBSERVATION, PRIVILEGED, KeyframeEnvironment
 from kfvo_ros.learning.episode import PRIVILEGED_SIZE, Episode
 from kfvo_ros.learning.reward import PaperReward, Reward
+from kfvo_ros.learning.validation import Validation
 from kfvo_ros.odometry import KeyframeOdometry
+from kfvo_ros.options import OdometryOptions
 from kfvo_ros.sequences.synthetic import SyntheticSequence
 
 FRAMES = 30
@@ -275,6 +277,13 @@ def test_a_sequence_without_truth_of_the_camera_is_refused(backbone):
 
     with pytest.raises(KfvoError, match='expected ground truth of the camera'):
         record(Blind(3, 'smooth', 3), backbone)
+
+
+def test_a_drive_that_never_moves_is_named(backbone, drives):
+    still = Drive('still', drives[0].frames, drives[0].encoded, np.tile(np.eye(4), (FRAMES, 1, 1)))
+    validation = Validation([still], backbone, assembly.setting_of(OdometryOptions(), backbone))
+    with pytest.raises(KfvoError, match='^still: the ground truth never moves'):
+        validation.score(Every())
 
 
 def test_stable_baselines_learns_in_it(drives):

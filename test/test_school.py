@@ -226,6 +226,17 @@ def test_drives_that_are_not_searched_for_garbage_keep_none(backbone):
         gc.enable()
 
 
+def test_images_of_many_sequences_are_not_held_at_once(backbone):
+    drives = Archive(backbone, READING, live=True).wholes(SEQUENCES)
+    assert len(drives) == len(SEQUENCES)
+    before = None
+    for drive in drives:
+        assert drive.frames[0].image.size > 0
+        assert before is None or before() is None
+        before = weakref.ref(drive)
+        del drive
+
+
 def test_workers_change_nothing(cache):
     told, earned = run(lesson(cache), workers=1)
     told_by_two, earned_by_two = run(lesson(cache), workers=2)

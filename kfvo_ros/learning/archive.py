@@ -8,7 +8,7 @@ import gc
 import hashlib
 import json
 import os
-from collections import OrderedDict
+from collections import OrderedDict, abc
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -52,6 +52,10 @@ class Archive:
     def whole(self, text: str) -> Drive:
         """Return the sequence as it is; raises KfvoError where it cannot be learned from."""
         return self._drive(text, None, 0)
+
+    def wholes(self, texts: tuple[str, ...]) -> Wholes:
+        """Return many sequences as they are."""
+        return Wholes(self, texts)
 
     def variant(self, text: str, augmentation: Augmentation, number: int) -> Drive:
         """Return one of its variants; raises KfvoError where it cannot be learned from."""
@@ -104,6 +108,20 @@ class Archive:
                 'augmentation': augmentation and asdict(augmentation)}
         digest = hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
         return f'{path.name[:32].replace(":", "-")}-{digest[:16]}'
+
+
+@dataclass(frozen=True)
+class Wholes(abc.Sequence[Drive]):
+    """Sequences of an archive, each asked for when its turn comes: not all images at once."""
+
+    archive: Archive
+    texts: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.texts)
+
+    def __getitem__(self, index: Any) -> Any:
+        return self.archive.whole(self.texts[index])
 
 
 def _files_of(path: Path) -> list[tuple[str, int, int]]:

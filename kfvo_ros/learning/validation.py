@@ -57,14 +57,13 @@ class Validation:
 
         Raises KfvoError for a drive that never moves.
         """
-        percents, kept = [], 0
+        percents, kept, frames = [], 0, 0
         for drive in self.drives:
             before_each()
             estimate, keyframes = self._run(policy, drive)
             percents.append(ate_percent(estimate, drive))
-            kept += keyframes
-        return Score(float(np.exp(np.mean(np.log(percents)))),
-                     kept / sum(len(drive) for drive in self.drives))
+            kept, frames = kept + keyframes, frames + len(drive)
+        return Score(float(np.exp(np.mean(np.log(percents)))), kept / frames)
 
     def _run(self, policy: KeyframePolicy, drive: Drive) -> tuple[Trajectory, int]:
         """Return the refined poses of all frames, and how many frames were kept."""
