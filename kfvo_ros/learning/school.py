@@ -30,7 +30,7 @@ from kfvo_ros.tracking import FEATURES
 
 LEAST_LEFT = 150
 """An episode begins anywhere but in so many last frames of a drive."""
-MOST_UNASKED = 50
+MOST_UNASKED = 10
 """So many episodes in a row without a decision, and no sequence left out, are enough."""
 
 Pupil = tuple[tuple[str, ...], np.random.SeedSequence]
