@@ -103,7 +103,7 @@ class Archive:
         reading = asdict(self.reading) | {
             'camera': camera and asdict(read_camera_info(Path(camera)))}
         what = {'version': __version__, 'text': str(path.resolve()) if path.exists() else text,
-                'changed_ns': _files_of(path) if path.exists() else 0,
+                'files': _files_of(path) if path.exists() else [],
                 'reading': reading, 'number': number, 'about': self.about,
                 'augmentation': augmentation and asdict(augmentation)}
         digest = hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
