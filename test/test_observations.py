@@ -57,3 +57,14 @@ def test_a_track_that_jumps_is_an_outlier_however_little_it_is_believed():
     solution = solve(tabulate(views, 0, Lens()), Initialiser(CAMERA.fx, 0), None, History())
     assert not np.isin(jumped, solution.points.ids).any()
     assert solution.solved.mean() > 0.8
+
+
+def test_a_frame_that_sees_nothing_may_be_anywhere():
+    cloud = PointCloud(0, noise=0.2)
+    views = [cloud.encode(index, pose).payload for index, pose in enumerate(moving_poses(8))]
+    solution = solve(tabulate(views, 0, Lens()), Initialiser(CAMERA.fx, 0), None, History())
+    mask = solution.problem.mask.copy()
+    mask[-1] = False
+    blind = replace(solution, problem=solution.problem._replace(mask=mask))
+    seeing, unseeing = (np.trace(each.covariance()[-1]) for each in (solution, blind))
+    assert np.isfinite(unseeing) and unseeing > 1000.0 * seeing > 0.0
