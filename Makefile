@@ -67,10 +67,10 @@ demo: $(INSTALLED)
 	$(VENV)/bin/python -m kfvo_ros.demo --output demo
 
 bench-node: $(INSTALLED)
-	$(VENV)/bin/python -m kfvo_ros.node_benchmark
+	$(VENV)/bin/python benchmarks/node.py
 
 bench-train: $(TOOLS)
-	$(VENV)/bin/python -m kfvo_ros.learning.benchmark
+	$(VENV)/bin/python benchmarks/training.py
 
 results: $(TOOLS)
 	cd '$(or $(wildcard $(KFVO_DATA)),.)' && '$(CURDIR)/$(VENV)/bin/python' -m \

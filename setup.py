@@ -17,7 +17,7 @@ setup(
     maintainer='The kfvo_ros authors',
     maintainer_email='maintainers@kfvo-ros.example',
     packages=find_packages(include=[NAME, f'{NAME}.*']),
-    package_data={f'{NAME}.benchmarking': ['published.yaml'],
+    package_data={f'{NAME}.evaluation': ['published.yaml'],
                   f'{NAME}.keyframes': ['*.safetensors']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),

@@ -17,20 +17,24 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from kfvo_ros import train
-from kfvo_ros.commands import make_parser, run_command
 from kfvo_ros.errors import KfvoError
-from kfvo_ros.learning.ablation_rows import ROWS, row_recipe
-from kfvo_ros.lists import names_in, numbers_in
-from kfvo_ros.options import add_arguments, from_arguments, option
-from kfvo_ros.sequences.spelling import spelled_out
+from kfvo_ros.training.ablation import ROWS, row_config
+from kfvo_ros.utils.commands import (
+    expand_ranges,
+    make_parser,
+    parse_names,
+    parse_numbers,
+    run_command,
+)
+from kfvo_ros.utils.config import add_arguments, from_arguments, option
 
 if TYPE_CHECKING:
     from kfvo_ros.backbones.base import Backbone
-    from kfvo_ros.learning.ablation_table import Outcome
-    from kfvo_ros.learning.examination import Examination
-    from kfvo_ros.learning.plan import Choices
-    from kfvo_ros.learning.recipe import Recipe
-    from kfvo_ros.learning.trial import Trial
+    from kfvo_ros.training.ablation import PolicyResult, TrainingRun
+    from kfvo_ros.training.config import TrainingConfig
+    from kfvo_ros.training.evaluation import PolicyEvaluation
+    from kfvo_ros.training.plan import TrainingSetup
+
 
 EXAMPLE = """example:
   python -m kfvo_ros.ablation synthetic:0-39 --validation synthetic:40-49 \\
@@ -73,25 +77,25 @@ def _ablate(argv: list[str]) -> None:
     # The heavy imports come after the arguments were checked: --help answers at once.
     arguments = _parse(argv)
     options, material = from_arguments(AblationOptions, arguments), _material(arguments)
-    rows = names_in(options.rows, 'rows', ROWS)
-    seeds = numbers_in(options.seeds, 'seeds')
+    rows = parse_names(options.rows, 'rows', ROWS)
+    seeds = parse_numbers(options.seeds, 'seeds')
     import matplotlib  # noqa: F401  what is missing is told before hours of training
     import stable_baselines3  # noqa: F401
     import tensorboard  # noqa: F401
 
-    from kfvo_ros import assembly
-    from kfvo_ros.learning.trial import Trial
-    from kfvo_ros.threads import single_threaded
+    from kfvo_ros.odometry import factory
+    from kfvo_ros.training.ablation import TrainingRun
+    from kfvo_ros.utils.process import single_threaded
     folder = Path(arguments.output).expanduser()
     options = replace(options, cache=options.cache or str(folder / CACHE))
     chosen = _choose(options)
     with single_threaded():
-        backbone = assembly.make_backbone(chosen.odometry)
-        trials: list[Trial] = []
+        backbone = factory.make_backbone(chosen.odometry)
+        trials: list[TrainingRun] = []
         for row in rows:
-            changed = replace(chosen, recipe=row_recipe(row, chosen.recipe, options.steps))
+            changed = replace(chosen, recipe=row_config(row, chosen.recipe, options.steps))
             plan = changed.plan(material.learned, material.validation, backbone)
-            trials += [Trial(row, replace(plan, seed=seed), folder) for seed in seeds]
+            trials += [TrainingRun(row, replace(plan, seed=seed), folder) for seed in seeds]
         for trial in trials:
             trial.prepare(options.resume)
         examination = _examination(chosen, material.test, backbone)
@@ -100,32 +104,32 @@ def _ablate(argv: list[str]) -> None:
           f'{folder / PAGE}, {folder / TABLE}, {folder / CURVES}')
 
 
-def _choose(options: AblationOptions) -> Choices:
+def _choose(options: AblationOptions) -> TrainingSetup:
     """Return what the test and all trainings have in common; raises KfvoError."""
-    from kfvo_ros.learning.plan import Choices
-    from kfvo_ros.learning.recipe import read_recipe
-    from kfvo_ros.options import OdometryOptions, SequenceOptions, VggtOptions
-    recipe = read_recipe(options.recipe)
+    from kfvo_ros.odometry.options import OdometryOptions, SequenceOptions, VggtOptions
+    from kfvo_ros.training.config import read_training_config
+    from kfvo_ros.training.plan import TrainingSetup
+    recipe = read_training_config(options.recipe)
     odometry = OdometryOptions(scale_rule=recipe.scale)
-    return Choices(odometry.seed, recipe, odometry, SequenceOptions(stop=options.stop),
-                   VggtOptions(), Path(options.cache or '').expanduser())
+    return TrainingSetup(odometry.seed, recipe, odometry, SequenceOptions(stop=options.stop),
+                         VggtOptions(), Path(options.cache or '').expanduser())
 
 
-def _examination(chosen: Choices, test: Sequence[str], backbone: Backbone) -> Examination:
+def _examination(chosen: TrainingSetup, test: Sequence[str], backbone: Backbone) -> PolicyEvaluation:
     """Return the test, its sequences tracked as in use; raises KfvoError."""
     from tqdm import tqdm
 
-    from kfvo_ros.learning.examination import Examination
+    from kfvo_ros.training.evaluation import PolicyEvaluation
     archive = chosen.archive(backbone)
-    return Examination({text: archive.whole(text)
-                        for text in tqdm(test, unit='sequence', desc='test')},
-                       backbone, chosen.odometry)
+    return PolicyEvaluation({text: archive.whole(text)
+                             for text in tqdm(test, unit='sequence', desc='test')},
+                            backbone, chosen.odometry)
 
 
-def _go_through(trials: Sequence[Trial], material: Material, options: AblationOptions,
-                examination: Examination, recipe: Recipe) -> None:
+def _go_through(trials: Sequence[TrainingRun], material: Material, options: AblationOptions,
+                examination: PolicyEvaluation, recipe: TrainingConfig) -> None:
     """Train and test one after the other; table and curves tell of all that there is so far."""
-    from kfvo_ros.keyframes.policy_file import read_policy
+    from kfvo_ros.keyframes.learned import read_policy
     outcomes = list(examination.unlearned(recipe))
     for number, trial in enumerate(trials, 1):
         print(f'{number} of {len(trials)}: {trial.row}, seed {trial.seed}', flush=True)
@@ -138,7 +142,7 @@ def _go_through(trials: Sequence[Trial], material: Material, options: AblationOp
         _write(trials[:number], outcomes)
 
 
-def _train(trial: Trial, material: Material, options: AblationOptions) -> None:
+def _train(trial: TrainingRun, material: Material, options: AblationOptions) -> None:
     """Train as kfvo_train does, from the start or from where it was interrupted."""
     argv = [*material.learned, '--validation', *material.validation]
     for name, value in {'recipe': trial.recipe_file, 'output': trial.files.output,
@@ -153,10 +157,10 @@ def _train(trial: Trial, material: Material, options: AblationOptions) -> None:
                         'above; --resume goes on from there')
 
 
-def _write(trials: Sequence[Trial], outcomes: Sequence[Outcome]) -> None:
+def _write(trials: Sequence[TrainingRun], outcomes: Sequence[PolicyResult]) -> None:
     """Write what came of these trials."""
-    from kfvo_ros.learning.ablation_table import write_csv, write_markdown
-    from kfvo_ros.learning.curves import plot_curves, read_curve
+    from kfvo_ros.training.ablation import write_csv, write_markdown
+    from kfvo_ros.training.curves import plot_curves, read_curve
     folder = trials[0].folder
     in_order = sorted(outcomes, key=lambda each: each.row not in ROWS)  # the learned ones first
     write_csv(folder / TABLE, in_order)
@@ -167,8 +171,8 @@ def _write(trials: Sequence[Trial], outcomes: Sequence[Outcome]) -> None:
 
 def _material(arguments: argparse.Namespace) -> Material:
     """Return the sequences; raises KfvoError where one is tested on that chose or was learned."""
-    material = Material(*map(spelled_out, (arguments.sequence, arguments.validation,
-                                           arguments.test)))
+    material = Material(*map(expand_ranges, (arguments.sequence, arguments.validation,
+                                             arguments.test)))
     for text in material.test:
         if text in (*material.learned, *material.validation):
             raise KfvoError(f'{text} is learned from, or chooses the best policy; expected other '

@@ -16,24 +16,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from kfvo_ros import __version__
-from kfvo_ros.commands import make_parser, run_command
 from kfvo_ros.errors import KfvoError, reason_of
 from kfvo_ros.keyframes import POLICIES
-from kfvo_ros.lists import names_in, numbers_in
-from kfvo_ros.options import (
-    OdometryOptions,
-    SequenceOptions,
-    VggtOptions,
-    add_arguments,
-    from_arguments,
-    option,
-)
+from kfvo_ros.odometry.options import OdometryOptions, SequenceOptions, VggtOptions
+from kfvo_ros.utils.commands import make_parser, parse_names, parse_numbers, run_command
+from kfvo_ros.utils.config import add_arguments, from_arguments, option
 
 if TYPE_CHECKING:
-    from kfvo_ros.benchmarking.examiner import Examiner
-    from kfvo_ros.benchmarking.plan import Plan
-    from kfvo_ros.benchmarking.rows import Row
-    from kfvo_ros.benchmarking.runs import Run
+    from kfvo_ros.evaluation.plan import BenchmarkPlan
+    from kfvo_ros.evaluation.records import Row
+    from kfvo_ros.evaluation.runner import Run
+    from kfvo_ros.evaluation.scoring import Evaluator
+
 
 EXAMPLES = """examples:
   python -m kfvo_ros.benchmark synthetic:0-4:smooth --output results
@@ -71,34 +65,34 @@ def _benchmark(argv: list[str]) -> None:
     options = from_arguments(BenchmarkOptions, arguments)
     if not options.no_pictures:
         import matplotlib  # noqa: F401  what is missing is told before hours of runs
-    from kfvo_ros.benchmarking.examiner import Examiner
-    from kfvo_ros.benchmarking.subjects import open_subjects
+    from kfvo_ros.evaluation.scoring import Evaluator
+    from kfvo_ros.evaluation.sequences import open_benchmark_sequences
     plan = _plan(arguments, options)
     _check(plan.folder, options)
-    runs = plan.runs(open_subjects(plan.sequences, plan.reading))
+    runs = plan.runs(open_benchmark_sequences(plan.sequences, plan.reading))
     finished = [run for run in runs if options.resume and run.is_finished()]
-    examiner = Examiner(plan.reading)
+    examiner = Evaluator(plan.reading)
     rows = _go_through(plan, runs, finished, examiner)
     _report(plan, runs, rows, examiner, not options.no_pictures)
 
 
-def _plan(arguments: argparse.Namespace, options: BenchmarkOptions) -> Plan:
+def _plan(arguments: argparse.Namespace, options: BenchmarkOptions) -> BenchmarkPlan:
     """Return what is asked for; raises KfvoError for what cannot be."""
-    from kfvo_ros.benchmarking.plan import Plan, default_methods, fitting_policy
-    from kfvo_ros.sequences.spelling import spelled_out
+    from kfvo_ros.evaluation.plan import BenchmarkPlan, default_methods, fitting_policy
+    from kfvo_ros.utils.commands import expand_ranges
     odometry = from_arguments(OdometryOptions, arguments)
-    methods = names_in(options.methods, 'methods', POLICIES) if options.methods \
+    methods = parse_names(options.methods, 'methods', POLICIES) if options.methods \
         else default_methods(odometry)
-    return Plan(tuple(arguments.sequence), spelled_out(arguments.sequence), methods,
-                numbers_in(options.seeds, 'seeds'), odometry,
-                from_arguments(VggtOptions, arguments), from_arguments(SequenceOptions, arguments),
-                options.jobs, Path(arguments.output).expanduser(),
-                fitting_policy(methods, odometry))
+    return BenchmarkPlan(tuple(arguments.sequence), expand_ranges(arguments.sequence), methods,
+                         parse_numbers(options.seeds, 'seeds'), odometry,
+                         from_arguments(VggtOptions, arguments), from_arguments(SequenceOptions, arguments),
+                         options.jobs, Path(arguments.output).expanduser(),
+                         fitting_policy(methods, odometry))
 
 
 def _check(folder: Path, options: BenchmarkOptions) -> None:
     """Make the folder; raises KfvoError where there are results nobody wants to lose."""
-    from kfvo_ros.benchmarking.plan import RUNS
+    from kfvo_ros.evaluation.plan import RUNS
     taken = [name for name in (RESULTS, RUNS) if (folder / name).exists()]
     if taken and not (options.resume or options.overwrite):
         raise KfvoError(f'{folder} already holds {", ".join(taken)}; choose another --output, or '
@@ -109,13 +103,13 @@ def _check(folder: Path, options: BenchmarkOptions) -> None:
         raise KfvoError(f'cannot write to {folder}: {reason_of(error)}') from error
 
 
-def _go_through(plan: Plan, runs: Sequence[Run], finished: Sequence[Run],
-                examiner: Examiner) -> list[Row]:
+def _go_through(plan: BenchmarkPlan, runs: Sequence[Run], finished: Sequence[Run],
+                examiner: Evaluator) -> list[Row]:
     """Run what is not finished; return all rows in order, which results.csv has as they come."""
     from tqdm import tqdm
 
-    from kfvo_ros.benchmarking.rows import append_rows, in_order, write_rows
-    from kfvo_ros.benchmarking.side_by_side import run_side_by_side
+    from kfvo_ros.evaluation.records import append_rows, in_order, write_rows
+    from kfvo_ros.evaluation.runner import run_in_parallel
     path, done = plan.folder / RESULTS, {run.folder for run in finished}
     rows = [row for run in finished for row in examiner.rows(run, None)]
     write_rows(path, rows)
@@ -131,7 +125,7 @@ def _go_through(plan: Plan, runs: Sequence[Run], finished: Sequence[Run],
                           file=sys.stderr)
 
         try:
-            run_side_by_side([run for run in runs if run.folder not in done], plan.jobs, ended)
+            run_in_parallel([run for run in runs if run.folder not in done], plan.jobs, ended)
         except KeyboardInterrupt as interruption:
             raise KfvoError(f'interrupted after {bar.n} of {len(runs)} runs, which are in {path}; '
                             '--resume goes on') from interruption
@@ -140,15 +134,15 @@ def _go_through(plan: Plan, runs: Sequence[Run], finished: Sequence[Run],
     return rows
 
 
-def _report(plan: Plan, runs: Sequence[Run], rows: Sequence[Row], examiner: Examiner,
+def _report(plan: BenchmarkPlan, runs: Sequence[Run], rows: Sequence[Row], examiner: Evaluator,
             with_pictures: bool) -> None:
     """Write the pages, and say what came of it; raises KfvoError where all failed."""
-    from kfvo_ros.benchmarking.markdown import markdown
-    from kfvo_ros.benchmarking.report import About, make_tables, write_report
-    from kfvo_ros.benchmarking.rows import FAILED
+    from kfvo_ros.evaluation.records import FAILED
+    from kfvo_ros.evaluation.render import markdown
+    from kfvo_ros.evaluation.report import About, make_tables, write_report
     pictures: tuple[Path, ...] = ()
     if with_pictures:
-        from kfvo_ros.benchmarking.drawing import draw
+        from kfvo_ros.evaluation.report import draw
         pictures = draw(plan.folder, runs, examiner)
     about = About(plan.command, __version__, plan.reading.stop, plan.policy_name)
     tables = make_tables(rows, about)

@@ -14,22 +14,19 @@ import numpy as np
 import yaml
 
 from kfvo_ros.errors import KfvoError, reason_of
-from kfvo_ros.yaml_file import read_yaml
+from kfvo_ros.utils.files import read_yaml
 
 DISTORTION_SIZES = {'none': (0,), 'plumb_bob': (4, 5), 'rational_polynomial': (8,),
                     'equidistant': (4,)}
 """Distortion models by their ROS name, and how many coefficients each may have."""
-
 MODEL_SYNONYMS = {'': 'none', 'none': 'none', 'pinhole': 'none', 'plumb_bob': 'plumb_bob',
                   'radtan': 'plumb_bob', 'radial-tangential': 'plumb_bob',
                   'rational_polynomial': 'rational_polynomial', 'equidistant': 'equidistant',
                   'fisheye': 'equidistant'}
-
 NEWTON_STEPS = 15
 """An ordinary lens takes three, the corners of a wide one eight."""
 CONVERGED = 1e-7
 """Steps square: after one of this size the error is some 1e-14."""
-
 MAX_VIEW_ANGLE = math.radians(80.0)
 """Rays farther off the axis have no usable pinhole coordinates."""
 MAX_READOUT = 0.2

@@ -12,9 +12,9 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from kfvo_ros.commands import make_parser, run_command
 from kfvo_ros.errors import KfvoError
-from kfvo_ros.interruption import signals_collected
+from kfvo_ros.utils.commands import make_parser, run_command
+from kfvo_ros.utils.process import signals_collected
 
 EXAMPLES = """examples:
   python -m kfvo_ros.convert V1_01_easy bags/V1_01 --topic /cam0/image_raw
@@ -35,13 +35,14 @@ def main(argv: list[str] | None = None) -> int:
 def _convert(argv: list[str]) -> None:
     # The heavy imports come after the arguments were checked: --help answers at once.
     arguments = _parse(argv)
-    from kfvo_ros.options import SequenceOptions, from_arguments
-    from kfvo_ros.recording.bag_writer import BagWriter
+    from kfvo_ros.odometry.options import SequenceOptions
+    from kfvo_ros.sequences.bag.writer import BagWriter
+    from kfvo_ros.utils.config import from_arguments
     options = from_arguments(SequenceOptions, arguments)
     writer = BagWriter(Path(os.path.abspath(arguments.bag)), arguments.zstd,
                        arguments.metadata_version)
-    from kfvo_ros.assembly import make_sequence
-    from kfvo_ros.recording.recorder import Recorder
+    from kfvo_ros.odometry.factory import make_sequence
+    from kfvo_ros.sequences.bag.recorder import Recorder
     sequence = make_sequence(arguments.sequence, options)
     recorder = Recorder(sequence, writer, arguments.topic, arguments.compressed)
     with signals_collected() as interrupts:
@@ -57,8 +58,9 @@ def _convert(argv: list[str]) -> None:
 
 
 def _parse(argv: list[str]) -> argparse.Namespace:
-    from kfvo_ros.options import SequenceOptions, add_arguments
-    from kfvo_ros.recording import CODECS
+    from kfvo_ros.odometry.options import SequenceOptions
+    from kfvo_ros.sequences.bag.messages import CODECS
+    from kfvo_ros.utils.config import add_arguments
     parser = make_parser(
         'kfvo_convert', 'Write any sequence as a bag that "ros2 bag play" plays.', EXAMPLES)
     parser.add_argument('sequence', help='dataset folder, ROS 1 or 2 bag, folder of images, '

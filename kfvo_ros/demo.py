@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from kfvo_ros import __version__
-from kfvo_ros.commands import make_parser, run_command
 from kfvo_ros.errors import KfvoError
+from kfvo_ros.utils.commands import make_parser, run_command
 
 SEQUENCE = 'synthetic:8:smooth'
 BAG, TRAJECTORY, SUMMARY, PICTURE = 'bag', 'trajectory.tum', 'summary.json', 'trajectory.png'
@@ -41,7 +41,7 @@ def _demonstrate(text: str, folder: Path) -> dict[str, Any]:
     """Convert, play, listen and evaluate; return the summary."""
     # The heavy imports come after the arguments were checked: --help answers at once.
     from kfvo_ros import convert
-    from kfvo_ros.rehearsal import rehearse
+    from kfvo_ros.ros.end_to_end import run_node
     from kfvo_ros.sequences import open_sequence
     sequence = open_sequence(text)
     truth = sequence.ground_truth()
@@ -54,7 +54,7 @@ def _demonstrate(text: str, folder: Path) -> dict[str, Any]:
     if convert.main([text, str(folder / BAG)]) != 0:
         raise KfvoError('the sequence could not be converted')
     print('2. kfvo_node and kfvo_play, over DDS', flush=True)
-    heard = rehearse(folder / BAG, sequence.topic, {
+    heard = run_node(folder / BAG, sequence.topic, {
         'queue_size': 10, 'trajectory_file': str(folder / TRAJECTORY)})
     print('3. evaluation', flush=True)
     return _evaluate(folder, text, truth.trajectory, heard)
@@ -64,8 +64,8 @@ def _evaluate(folder: Path, text: str, truth: Any, heard: Any) -> dict[str, Any]
     """Write summary and picture."""
     import numpy as np
 
-    from kfvo_ros.plots import plot_trajectory
-    from kfvo_ros.results import evaluate
+    from kfvo_ros.evaluation.plots import plot_trajectory
+    from kfvo_ros.odometry.results import evaluate
     from kfvo_ros.sequences.base import GroundTruth
     from kfvo_ros.trajectory import read_tum
     estimate = read_tum(folder / TRAJECTORY)

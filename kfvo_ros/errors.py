@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The one exception that a user is meant to read, and the words of all others."""
 
+from __future__ import annotations
+
 
 class KfvoError(Exception):
     """Bad input or an impossible request, told in one line.

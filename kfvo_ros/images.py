@@ -31,7 +31,6 @@ class PixelLayout(NamedTuple):
 
 BAYER_CODES = {'bayer_rggb': cv2.COLOR_BayerRGGB2RGB, 'bayer_bggr': cv2.COLOR_BayerBGGR2RGB,
                'bayer_gbrg': cv2.COLOR_BayerGBRG2RGB, 'bayer_grbg': cv2.COLOR_BayerGRBG2RGB}
-
 LAYOUTS = {
     'mono8': PixelLayout(1, 1), '8uc1': PixelLayout(1, 1),
     'mono16': PixelLayout(2, 1), '16uc1': PixelLayout(2, 1),

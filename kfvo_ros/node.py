@@ -7,8 +7,8 @@ from __future__ import annotations
 import sys
 import time
 
-from kfvo_ros.commands import make_parser, run_command
-from kfvo_ros.interruption import Interrupted, ignore_signals, signals_held
+from kfvo_ros.utils.commands import make_parser, run_command
+from kfvo_ros.utils.process import Interrupted, ignore_signals, signals_blocked
 
 EXAMPLES = """examples:
   kfvo_node --ros-args -r image:=/camera/image_raw
@@ -22,12 +22,12 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _run(argv: list[str]) -> None:
-    with signals_held():
+    with signals_blocked():
         from kfvo_ros.ros.node import KfvoNode
-        from kfvo_ros.ros.session import spinning, without_ros_arguments
-        from kfvo_ros.threads import single_threaded
-    _parse(without_ros_arguments(argv))
-    with single_threaded(), spinning(KfvoNode, argv) as node:
+        from kfvo_ros.ros.runtime import remove_ros_arguments, spinning_node
+        from kfvo_ros.utils.process import single_threaded
+    _parse(remove_ros_arguments(argv))
+    with single_threaded(), spinning_node(KfvoNode, argv) as node:
         try:
             while node.context.ok():
                 time.sleep(0.5)
@@ -39,8 +39,8 @@ def _run(argv: list[str]) -> None:
 
 
 def _parse(argv: list[str]) -> None:
-    from kfvo_ros.options import OdometryOptions, VggtOptions
-    from kfvo_ros.ros.parameters import NodeOptions, describe
+    from kfvo_ros.odometry.options import OdometryOptions, VggtOptions
+    from kfvo_ros.ros.options import NodeOptions, describe
     make_parser('kfvo_node', 'Visual odometry of one camera. All choices are ROS parameters:\n\n'
                 + describe(NodeOptions, OdometryOptions, VggtOptions), EXAMPLES).parse_args(argv)
 

@@ -10,9 +10,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from kfvo_ros.commands import make_parser, run_command
 from kfvo_ros.errors import KfvoError
-from kfvo_ros.interruption import Interrupted, ignore_signals, signals_held
+from kfvo_ros.utils.commands import make_parser, run_command
+from kfvo_ros.utils.process import Interrupted, ignore_signals, signals_blocked
 
 EXAMPLES = """examples:
   python -m kfvo_ros.play MH_01_easy.bag --wait-for-subscribers
@@ -20,7 +20,6 @@ EXAMPLES = """examples:
   python -m kfvo_ros.play demo/bag --topic /cam0/image_raw --rate 0.5
   python -m kfvo_ros.play MH_01_easy.bag --ros-args -r /cam0/image_raw:=/image
 """
-
 _log = logging.getLogger('kfvo_ros.play')  # not __main__, as which it is run
 
 
@@ -34,16 +33,17 @@ def main(argv: list[str] | None = None) -> int:
 
 def _run(argv: list[str]) -> None:
     # The heavy imports come after the arguments were checked: --help answers at once.
-    with signals_held():
-        from kfvo_ros.options import PlayOptions, from_arguments
+    with signals_blocked():
+        from kfvo_ros.ros.options import PlayOptions
+        from kfvo_ros.utils.config import from_arguments
         arguments = _parse(argv)
         options = from_arguments(PlayOptions, arguments)
         from kfvo_ros.ros.player import Player, make_node
-        from kfvo_ros.ros.session import spinning
-        from kfvo_ros.sequences.bag_reader import Bag
+        from kfvo_ros.ros.runtime import spinning_node
+        from kfvo_ros.sequences.bag.reader import Bag
     with Bag(Path(arguments.bag)) as bag:
         topics = _choose_topics(bag, options.topic)
-        with spinning(make_node, argv) as node:
+        with spinning_node(make_node, argv) as node:
             player = Player(node, bag, topics, options)
             try:
                 player.play()
@@ -56,13 +56,14 @@ def _run(argv: list[str]) -> None:
 
 
 def _parse(argv: list[str]) -> argparse.Namespace:
-    from kfvo_ros.options import PlayOptions, add_arguments
+    from kfvo_ros.ros.options import PlayOptions
+    from kfvo_ros.utils.config import add_arguments
     parser = make_parser('kfvo_play', 'Play a bag onto ROS topics.', EXAMPLES)
     parser.add_argument('bag', help='ROS 1 .bag, ROS 2 folder with metadata.yaml, .mcap or .db3')
     add_arguments(parser, PlayOptions)
     if '--ros-args' in argv:
-        from kfvo_ros.ros.session import without_ros_arguments
-        argv = without_ros_arguments(argv)
+        from kfvo_ros.ros.runtime import remove_ros_arguments
+        argv = remove_ros_arguments(argv)
     return parser.parse_args(argv)
 
 

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from kfvo_ros import __version__
-from kfvo_ros.commands import make_parser, run_command
 from kfvo_ros.errors import KfvoError
-from kfvo_ros.interruption import signals_collected
+from kfvo_ros.utils.commands import make_parser, run_command
+from kfvo_ros.utils.process import signals_collected
 
 EXAMPLES = """examples:
   python -m kfvo_ros.run synthetic:7 --output out
@@ -29,16 +29,17 @@ def main(argv: list[str] | None = None) -> int:
 
 def _run(argv: list[str]) -> None:
     # The heavy imports come after the arguments were checked: --help answers at once.
-    from kfvo_ros.options import OdometryOptions, SequenceOptions, VggtOptions, from_arguments
+    from kfvo_ros.odometry.options import OdometryOptions, SequenceOptions, VggtOptions
+    from kfvo_ros.utils.config import from_arguments
     arguments = _parse(argv)
-    from kfvo_ros import assembly
-    from kfvo_ros.results import ResultWriter
-    from kfvo_ros.threads import single_threaded
+    from kfvo_ros.odometry import factory
+    from kfvo_ros.odometry.results import ResultWriter
+    from kfvo_ros.utils.process import single_threaded
     odometry_options = from_arguments(OdometryOptions, arguments)
     sequence_options = from_arguments(SequenceOptions, arguments)
     with single_threaded():
-        sequence = assembly.make_sequence(arguments.sequence, sequence_options)
-        odometry = assembly.make_odometry(odometry_options, assembly.make_backbone(
+        sequence = factory.make_sequence(arguments.sequence, sequence_options)
+        odometry = factory.make_odometry(odometry_options, factory.make_backbone(
             odometry_options, from_arguments(VggtOptions, arguments)))
         truth = sequence.ground_truth()
         writer = ResultWriter(Path(arguments.output), arguments.overwrite)
@@ -56,7 +57,8 @@ def _run(argv: list[str]) -> None:
 
 
 def _parse(argv: list[str]) -> argparse.Namespace:
-    from kfvo_ros.options import OdometryOptions, SequenceOptions, VggtOptions, add_arguments
+    from kfvo_ros.odometry.options import OdometryOptions, SequenceOptions, VggtOptions
+    from kfvo_ros.utils.config import add_arguments
     parser = make_parser('kfvo_run', 'Visual odometry over every frame of a sequence.', EXAMPLES)
     parser.add_argument('sequence', help='dataset folder, bag, folder of images, video, or '
                         'synthetic:SEED[:smooth|fast|mixed|street]')

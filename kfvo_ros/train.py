@@ -14,17 +14,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from kfvo_ros import __version__
-from kfvo_ros.commands import make_parser, run_command
 from kfvo_ros.errors import KfvoError
-from kfvo_ros.interruption import Interrupted, signals_collected
-from kfvo_ros.learning.witness import Witness
+from kfvo_ros.training.evaluation import TrainingCallback
+from kfvo_ros.utils.commands import make_parser, run_command
+from kfvo_ros.utils.process import Interrupted, signals_collected
 
 if TYPE_CHECKING:
     from kfvo_ros.backbones.base import Backbone
-    from kfvo_ros.learning.files import TrainingFiles
-    from kfvo_ros.learning.plan import Choices, Plan
-    from kfvo_ros.learning.training import Training
-    from kfvo_ros.learning.validation import Score, Validation
+    from kfvo_ros.training.evaluation import Score, Validation
+    from kfvo_ros.training.plan import TrainingFiles, TrainingPlan, TrainingSetup
+    from kfvo_ros.training.ppo import Training
+
 
 EXAMPLES = """examples:
   python -m kfvo_ros.train --smoke --output smoke.safetensors
@@ -50,17 +50,17 @@ def _train(argv: list[str]) -> None:
     arguments = _parse(argv)
     import tensorboard  # noqa: F401  who writes the logs would not tell that it is missing
 
-    from kfvo_ros import assembly
-    from kfvo_ros.learning.checkpoint import read_checkpoint
-    from kfvo_ros.learning.files import TrainingFiles
-    from kfvo_ros.learning.school import make_environment
-    from kfvo_ros.learning.training import Training
-    from kfvo_ros.threads import single_threaded
+    from kfvo_ros.odometry import factory
+    from kfvo_ros.training.checkpoint import read_checkpoint
+    from kfvo_ros.training.plan import TrainingFiles
+    from kfvo_ros.training.ppo import Training
+    from kfvo_ros.training.sampler import make_environment
+    from kfvo_ros.utils.process import single_threaded
     files = TrainingFiles(arguments.output)
     files.check(arguments.resume, arguments.overwrite)
     chosen = _choose(arguments)
     with single_threaded():
-        backbone = assembly.make_backbone(chosen.odometry, chosen.vggt)
+        backbone = factory.make_backbone(chosen.odometry, chosen.vggt)
         plan = chosen.plan(arguments.sequence, arguments.validation, backbone)
         checkpoint = read_checkpoint(files.checkpoint, plan) if arguments.resume else None
         # What cannot be learned from is told before hours of validation.
@@ -96,7 +96,7 @@ def _learn(training: Training, files: TrainingFiles) -> None:
           f'{training.steps} steps; checkpoint, logs and last policy are in {files.folder}')
 
 
-class Display(Witness):
+class Display(TrainingCallback):
     """A progress bar, and a row of a table for each validation.
 
     Raises Interrupted once a signal is in `interruptions`.
@@ -131,14 +131,14 @@ def _row(name: str, score: Score) -> str:
     return f'{name:<26}{score.ate_percent:>10.3f} %{100.0 * score.kept:>14.1f} %'
 
 
-def _validation(plan: Plan, chosen: Choices, backbone: Backbone
+def _validation(plan: TrainingPlan, chosen: TrainingSetup, backbone: Backbone
                 ) -> tuple[Validation | None, dict[str, Score]]:
     """Return what validates, with the scores of heuristics and teacher, which are printed."""
     from tqdm import tqdm
 
-    from kfvo_ros import assembly
-    from kfvo_ros.learning.references import references
-    from kfvo_ros.learning.validation import Validation
+    from kfvo_ros.odometry import factory
+    from kfvo_ros.training.baselines import reference_policies
+    from kfvo_ros.training.evaluation import Validation
     if not plan.validation:
         print('no validation: the last policy is the one that is kept; name sequences with '
               '--validation')
@@ -146,21 +146,22 @@ def _validation(plan: Plan, chosen: Choices, backbone: Backbone
     drives = chosen.archive(backbone).wholes(plan.validation)
     for _ in tqdm(drives, unit='sequence', desc='validation'):
         pass  # what cannot be read is told now, and what is tracked is kept
-    validation = Validation(drives, backbone, assembly.setting_of(chosen.odometry, backbone))
+    validation = Validation(drives, backbone, factory.signature_of(chosen.odometry, backbone))
     print(f'{f"{len(drives)} sequences":<26}{"ATE of path":>12}{"keyframes":>16}')
     scores = {}
-    for name, policy in references(plan.recipe, chosen.odometry, backbone).items():
+    for name, policy in reference_policies(plan.recipe, chosen.odometry, backbone).items():
         scores[name] = validation.score(policy)
         print(_row(name, scores[name]), flush=True)
     return validation, scores
 
 
-def _choose(arguments: argparse.Namespace) -> Choices:
+def _choose(arguments: argparse.Namespace) -> TrainingSetup:
     """Return what the recipe says, as the command line changes it."""
-    from kfvo_ros.learning.plan import Choices
-    from kfvo_ros.learning.recipe import read_recipe
-    from kfvo_ros.options import OdometryOptions, SequenceOptions, VggtOptions, from_arguments
-    recipe = read_recipe(arguments.recipe)
+    from kfvo_ros.odometry.options import OdometryOptions, SequenceOptions, VggtOptions
+    from kfvo_ros.training.config import read_training_config
+    from kfvo_ros.training.plan import TrainingSetup
+    from kfvo_ros.utils.config import from_arguments
+    recipe = read_training_config(arguments.recipe)
     reading = from_arguments(SequenceOptions, arguments)
     if arguments.smoke:
         recipe = recipe.shortened()
@@ -170,19 +171,15 @@ def _choose(arguments: argparse.Namespace) -> Choices:
                      environments=arguments.environments or recipe.environments)
     odometry = from_arguments(OdometryOptions, arguments)
     settled = replace(odometry, scale_rule=odometry.scale_rule or recipe.scale, seed=0)
-    return Choices(odometry.seed, recipe, settled, reading,
-                   from_arguments(VggtOptions, arguments),
-                   Path(arguments.cache).expanduser() if arguments.cache else None)
+    return TrainingSetup(odometry.seed, recipe, settled, reading,
+                         from_arguments(VggtOptions, arguments),
+                         Path(arguments.cache).expanduser() if arguments.cache else None)
 
 
 def _parse(argv: list[str]) -> argparse.Namespace:
-    from kfvo_ros.options import (
-        OdometryOptions,
-        SequenceOptions,
-        TrainOptions,
-        VggtOptions,
-        add_arguments,
-    )
+    from kfvo_ros.odometry.options import OdometryOptions, SequenceOptions, VggtOptions
+    from kfvo_ros.training.config import TrainOptions
+    from kfvo_ros.utils.config import add_arguments
     parser = make_parser('kfvo_train', 'Learn which frames to keep: PPO of a keyframe policy.',
                          EXAMPLES)
     parser.add_argument('sequence', nargs='*', help='dataset folders or bags with ground truth, '

@@ -16,15 +16,13 @@ import numpy as np
 
 from kfvo_ros import geometry
 from kfvo_ros.errors import KfvoError
-from kfvo_ros.text_rows import parse_floats, parse_pose, read_rows
+from kfvo_ros.utils.files import parse_floats, parse_pose, read_rows
 
 NANOSECONDS = 1_000_000_000
 ASSOCIATION_LIMIT_NS = 10_000_000
 """Ground truth farther than this from a frame is not its ground truth (10 ms)."""
-
 UNKNOWN_VARIANCE = 9999.0
 """Variance of a velocity that nobody measured, as rtabmap has it; zero would mean exact."""
-
 _DECIMAL = re.compile(r'([+-]?)([0-9]*)\.?([0-9]*)(?:[eE]([+-]?[0-9]{1,3}))?')
 
 

@@ -16,7 +16,7 @@ from sequence_writers import HEIGHT, WIDTH, make_image, make_poses, pose_numbers
 
 from kfvo_ros.camera import Camera
 from kfvo_ros.sequences import open_sequence
-from kfvo_ros.sequences.bag import BagSequence
+from kfvo_ros.sequences.bag.sequence import BagSequence
 
 STORAGES = ('ros1', 'sqlite3', 'mcap')
 

@@ -11,8 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from kfvo_ros.interruption import SIGNALS
-from kfvo_ros.threads import single_threaded
+from kfvo_ros.utils.process import SIGNALS, single_threaded
 
 OVER_DDS = ('test_demo', 'test_node', 'test_play', 'test_vggt_node')
 """Files whose processes talk to each other, and are timed: one after the other."""

@@ -21,7 +21,7 @@ from ros_processes import Listener, running_module, wait_until
 from kfvo_ros import geometry
 from kfvo_ros.camera import Camera
 from kfvo_ros.sequences.base import Frame
-from kfvo_ros.sequences.synthetic import SyntheticSequence
+from kfvo_ros.sequences.synthetic.sequence import SyntheticSequence
 from kfvo_ros.trajectory import NANOSECONDS
 
 builtin_interfaces = pytest.importorskip('builtin_interfaces.msg')

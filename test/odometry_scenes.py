@@ -13,14 +13,14 @@ import numpy as np
 from kfvo_ros import geometry
 from kfvo_ros.backbones.base import Backbone, Encoded, Window
 from kfvo_ros.backbones.geometric.backbone import GeometricBackbone
-from kfvo_ros.backbones.geometric.observations import View
+from kfvo_ros.backbones.geometric.observations import FrameTracks
 from kfvo_ros.camera import Camera
 from kfvo_ros.keyframes.base import DecisionInput, KeyframePolicy
 from kfvo_ros.keyframes.heuristics import Survival
-from kfvo_ros.odometry import KeyframeOdometry, Placed, Update
+from kfvo_ros.odometry.keyframe_odometry import FramePose, KeyframeOdometry, Update
 from kfvo_ros.sequences.base import Frame
-from kfvo_ros.sequences.synthetic import SyntheticSequence
-from kfvo_ros.tracking import Tracks
+from kfvo_ros.sequences.synthetic.sequence import SyntheticSequence
+from kfvo_ros.tracking.tracker import Tracks
 from kfvo_ros.trajectory import Trajectory
 
 CAMERA = Camera(640, 480, 400.0, 400.0, 319.5, 239.5)
@@ -57,7 +57,7 @@ class PointCloud:
         pixels, visible = self.pixels(T_world_camera)
         pixels = pixels + self.noise * self._rng.normal(size=pixels.shape)
         tracks = sure(np.flatnonzero(visible), pixels[visible])
-        view = View(index, tracks, CAMERA.undistort(tracks.pixels))
+        view = FrameTracks(index, tracks, CAMERA.undistort(tracks.pixels))
         descriptor = np.full(48, index, dtype=np.float32)
         return Encoded(index * RATE_NS, descriptor, view, tracks)
 
@@ -106,7 +106,7 @@ class Run:
     """All that came out of an odometry."""
 
     updates: list[Update]
-    placed: list[Placed]
+    placed: list[FramePose]
     handed_out: list[np.ndarray]
 
     @property

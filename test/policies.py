@@ -9,9 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from kfvo_ros.keyframes.learned import Actor, Layer, Setting
-from kfvo_ros.keyframes.policy_file import PolicyFile
-from kfvo_ros.keyframes.rail import Rail
+from kfvo_ros.keyframes.guard import KeyframeGuard
+from kfvo_ros.keyframes.learned import Actor, Layer, PolicyFile, PolicySignature
 
 ALWAYS, NEVER = (-1e6, 1e6), (1e6, -1e6)
 """Biases to drop and to keep: of a policy that keeps, and one that drops but for the rail."""
@@ -27,9 +26,9 @@ def random_actor(size: int, seed: int = 0) -> Actor:
                        for last, out in zip(sizes, sizes[1:])))
 
 
-def write_policy(path: Path, setting: Setting, bias: tuple[float, float]) -> Path:
+def write_policy(path: Path, setting: PolicySignature, bias: tuple[float, float]) -> Path:
     """Write a policy for this setting that does what the bias says."""
     actor = random_actor(sum(size for _, size in setting.observation))
     last = replace(actor.layers[-1], bias=np.array(bias, np.float32))
-    PolicyFile(replace(actor, layers=(*actor.layers[:-1], last)), Rail(), setting).write(path)
+    PolicyFile(replace(actor, layers=(*actor.layers[:-1], last)), KeyframeGuard(), setting).write(path)
     return path

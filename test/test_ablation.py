@@ -19,13 +19,14 @@ pytest.importorskip('stable_baselines3', reason="stable-baselines3 is not instal
 pytest.importorskip('tensorboard', reason="tensorboard is not installed: pip install '.[train]'")
 pytest.importorskip('matplotlib', reason="matplotlib is not installed: pip install '.[demo]'")
 
-from kfvo_ros import ablation, assembly
-from kfvo_ros.config_files import find_config
-from kfvo_ros.keyframes.policy_file import read_policy
-from kfvo_ros.learning.ablation_rows import ROWS, row_recipe
-from kfvo_ros.learning.curves import read_curve
-from kfvo_ros.learning.recipe import read_recipe
-from kfvo_ros.learning.reward import ALPHA
+from kfvo_ros import ablation
+from kfvo_ros.keyframes.learned import read_policy
+from kfvo_ros.odometry import factory
+from kfvo_ros.training.ablation import ROWS, row_config
+from kfvo_ros.training.config import read_training_config
+from kfvo_ros.training.curves import read_curve
+from kfvo_ros.training.rewards import ALPHA
+from kfvo_ros.utils.files import find_config
 
 pytestmark = pytest.mark.usefixtures('own_signals')
 
@@ -102,9 +103,9 @@ def test_the_table_has_all_rows_and_the_curves_are_a_picture(done):
 
 
 def test_a_teacher_has_a_row_of_its_own(folder):
-    recipe = read_recipe('train.yaml')
+    recipe = read_training_config('train.yaml')
     chosen = ablation._choose(ablation.AblationOptions(stop=30, cache=str(folder / 'cache')))
-    backbone = assembly.make_backbone(chosen.odometry)
+    backbone = factory.make_backbone(chosen.odometry)
     examination = ablation._examination(chosen, TESTED[:1], backbone)
     outcomes = list(examination.unlearned(recipe))
     assert [each.row for each in outcomes if each.row != 'random'] == [
@@ -121,8 +122,8 @@ def test_each_row_learned_what_it_says(done):
     assert parts['local_signals_only'] and not parts['local_signals_only'] & parts['full']
     assert [policy.training['recipe']['reward'] for policy in told.values()] == ['paper', 'local']
     assert [policy.training['seed'] for policy in told.values()] == [1, 1]
-    assert read_recipe(str(done / 'full.yaml')) == row_recipe(
-        'full', read_recipe(str(done.parent / 'few.yaml')), 64)
+    assert read_training_config(str(done / 'full.yaml')) == row_config(
+        'full', read_training_config(str(done.parent / 'few.yaml')), 64)
     command = told['full'].training['command']
     assert command.startswith('python -m kfvo_ros.train synthetic:1:smooth synthetic:2:smooth')
     assert str(done / 'full.yaml') in command
@@ -225,8 +226,8 @@ def test_what_is_missing_is_named(missing, capsys):
 
 
 def test_rows_differ_from_full_in_one_thing():
-    recipe = read_recipe('train.yaml')
-    rows = {name: row_recipe(name, recipe, 80_000) for name in ROWS}
+    recipe = read_training_config('train.yaml')
+    rows = {name: row_config(name, recipe, 80_000) for name in ROWS}
     full = vars(rows['full'])
     assert (full['reward'], full['alpha'], full['without']) == ('paper', ALPHA, ('signals',))
     changed = {name: {key: value for key, value in vars(rows[name]).items() if value != full[key]}
@@ -235,7 +236,7 @@ def test_rows_differ_from_full_in_one_thing():
     assert changed['without_descriptor'] == {'without': ('descriptor', 'signals')}
     assert changed['without_alpha'] == {'alpha': 0.0}
     assert changed['alpha_penalty'] == {'alpha': -2.5e-5}
-    assert rows['local'] == row_recipe('local', recipe, 80_000)
+    assert rows['local'] == row_config('local', recipe, 80_000)
     assert {key for key, value in vars(rows['local']).items() if value != vars(recipe)[key]} \
         == {'steps', 'validation_every', 'without'}
     assert {key for key in full if vars(rows['local_signals_only'])[key]

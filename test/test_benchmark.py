@@ -23,10 +23,11 @@ from sequence_writers import write_camera_info, write_image, write_kitti
 
 pytest.importorskip('matplotlib', reason="matplotlib is not installed: pip install '.[demo]'")
 
-from kfvo_ros import assembly, benchmark
-from kfvo_ros.keyframes.learned import Setting
-from kfvo_ros.metrics import absolute_trajectory_error
-from kfvo_ros.options import OdometryOptions
+from kfvo_ros import benchmark
+from kfvo_ros.evaluation.metrics import absolute_trajectory_error
+from kfvo_ros.keyframes.learned import PolicySignature
+from kfvo_ros.odometry import factory
+from kfvo_ros.odometry.options import OdometryOptions
 from kfvo_ros.sequences import open_sequence
 from kfvo_ros.trajectory import read_tum
 
@@ -72,7 +73,7 @@ def sequences(tmp_path_factory) -> list[Path]:
 def policy(tmp_path_factory) -> Path:
     """Return a policy that keeps every frame."""
     options = OdometryOptions()
-    setting = assembly.setting_of(options, assembly.make_backbone(options))
+    setting = factory.signature_of(options, factory.make_backbone(options))
     return write_policy(tmp_path_factory.mktemp('policy') / 'p.safetensors', setting, ALWAYS)
 
 
@@ -172,7 +173,7 @@ def test_results_of_something_else_are_not_mixed_in(more, part, done, sequences,
 def test_another_policy_of_the_same_name_is_something_else(done, sequences, policy, capsys):
     kept = policy.read_bytes()
     try:
-        write_policy(policy, Setting('geometric', 'depth', 8, (('gap', 1),)), ALWAYS)
+        write_policy(policy, PolicySignature('geometric', 'depth', 8, (('gap', 1),)), ALWAYS)
         arguments = command(sequences[:1], policy, done[0], '--resume')[2:]
         assert benchmark.main([str(each) for each in arguments]) == 1
     finally:

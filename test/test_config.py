@@ -14,9 +14,9 @@ import pytest
 import yaml
 
 from kfvo_ros.camera import read_camera_info
-from kfvo_ros.config_files import find_config
-from kfvo_ros.options import OdometryOptions, VggtOptions
+from kfvo_ros.odometry.options import OdometryOptions, VggtOptions
 from kfvo_ros.sequences.tum import FREIBURG
+from kfvo_ros.utils.files import find_config
 
 ROOT = Path(__file__).resolve().parent.parent
 PRESETS = ('euroc', 'tum', 'kitti')

@@ -14,7 +14,7 @@ from command_lines import assert_one_readable_line, run_interrupted, run_python
 from recordings import assert_same, write_sequence
 
 from kfvo_ros.sequences import open_sequence
-from kfvo_ros.sequences.synthetic import SyntheticSequence
+from kfvo_ros.sequences.synthetic.sequence import SyntheticSequence
 
 command = partial(run_python, '-m', 'kfvo_ros.convert')
 

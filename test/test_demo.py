@@ -14,7 +14,7 @@ import pytest
 from ros_processes import run_module
 
 from kfvo_ros.errors import KfvoError
-from kfvo_ros.rehearsal import rehearse
+from kfvo_ros.ros.end_to_end import run_node
 from kfvo_ros.trajectory import read_tum
 
 pytest.importorskip('matplotlib', reason="matplotlib is not installed: pip install '.[demo]'")
@@ -52,11 +52,11 @@ def test_demo_wants_ground_truth(tmp_path: Path) -> None:
 
 def test_a_node_that_does_not_start_is_not_waited_for(tmp_path: Path) -> None:
     with pytest.raises(KfvoError, match='kfvo_node does not run'):
-        rehearse(tmp_path / 'bag', '/image', {'window_size': 2})
+        run_node(tmp_path / 'bag', '/image', {'window_size': 2})
 
 
 def test_node_benchmark_accounts_for_every_image() -> None:
-    outcome = run_module('kfvo_ros.node_benchmark', '--seconds', '2', timeout=120.0)
+    outcome = run_module('benchmarks.node', '--seconds', '2', timeout=120.0)
     assert outcome.returncode == 0, outcome.stderr
     lines = re.findall(r'^(20 Hz|twice capacity) .*: (\d+) images, .* (-?\d+) unaccounted',
                        outcome.stdout, re.MULTILINE)

@@ -22,7 +22,7 @@ from command_lines import assert_one_readable_line, run_python
 import kfvo_ros
 from kfvo_ros.camera import read_camera_info
 from kfvo_ros.errors import KfvoError
-from kfvo_ros.requirements import OPTIONAL_PIP_NAMES, PIP_NAMES, missing_dependency
+from kfvo_ros.utils.commands import OPTIONAL_PIP_NAMES, PIP_NAMES, missing_dependency
 
 ROOT = Path(__file__).resolve().parent.parent
 SOURCES = sorted((ROOT / 'kfvo_ros').rglob('*.py'))
@@ -34,14 +34,12 @@ BUILT = ('.git', '.venv*', '*.egg-info', '__pycache__', '.*_cache', 'build', 'in
          'demo', 'results')
 
 # Rooms by floor, the ground first; modules that are not named stand on the ground.
-FLOORS = ((), ('sequences',), ('backbones',), ('keyframes',), ('knowledge', 'odometry', 'scale'),
-          ('assembly', 'body', 'live', 'options', 'plots', 'recording', 'results'),
-          ('benchmarking', 'learning', 'ros'),
-          ('rehearsal',),
-          ('benchmark', 'convert', 'demo', 'node', 'node_benchmark', 'play', 'run', 'train'),
+FLOORS = ((), ('tracking', 'sequences'), ('backbones', 'keyframes'), ('odometry',),
+          ('evaluation', 'training', 'ros'),
+          ('benchmark', 'convert', 'demo', 'node', 'play', 'run', 'train'),
           ('ablation',))
 HEAVY = ('rclpy', 'torch', 'scipy', 'stable_baselines3')
-MAY_BE_HEAVY = ('kfvo_ros.ros', 'kfvo_ros.learning', 'kfvo_ros.backbones.vggt')
+MAY_BE_HEAVY = ('kfvo_ros.ros', 'kfvo_ros.training', 'kfvo_ros.backbones.vggt')
 
 
 def module_name(path: Path) -> str:
@@ -98,8 +96,8 @@ def test_a_node_without_vggt_does_without_torch() -> None:
         pytest.skip("rclpy is not installed: source a ROS 2 or pip install '.[ros]'")
     code = ('import sys\n'
             'import kfvo_ros.node, kfvo_ros.run, kfvo_ros.ros.node\n'
-            'from kfvo_ros.assembly import make_odometry\n'
-            'from kfvo_ros.options import OdometryOptions\n'
+            'from kfvo_ros.odometry.factory import make_odometry\n'
+            'from kfvo_ros.odometry.options import OdometryOptions\n'
             'odometry = make_odometry(OdometryOptions())\n'
             'assert (odometry.backbone.name, odometry.policy.name) == ("geometric", "learned")\n'
             'print(*sys.modules)')
@@ -211,7 +209,7 @@ def test_installed_files(workspace: Path) -> None:
     assert (share / 'package.xml').is_file()
     for folder in ('config', 'launch', 'rviz', 'foxglove'):
         assert (share / folder / 'probe').is_file()
-    assert (next(installed.glob('lib/python3*/site-packages')) / 'kfvo_ros' / 'benchmarking'
+    assert (next(installed.glob('lib/python3*/site-packages')) / 'kfvo_ros' / 'evaluation'
             / 'published.yaml').is_file()
     scripts = {path.name: path for path in (installed / 'lib' / 'kfvo_ros').iterdir()}
     assert set(scripts) == set(COMMANDS)

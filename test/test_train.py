@@ -25,12 +25,12 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from kfvo_ros import run, train
-from kfvo_ros.config_files import find_config
 from kfvo_ros.errors import KfvoError
-from kfvo_ros.interruption import SIGNALS
-from kfvo_ros.keyframes.policy_file import read_policy
-from kfvo_ros.learning.files import TrainingFiles
-from kfvo_ros.learning.training import Training
+from kfvo_ros.keyframes.learned import read_policy
+from kfvo_ros.training.plan import TrainingFiles
+from kfvo_ros.training.ppo import Training
+from kfvo_ros.utils.files import find_config
+from kfvo_ros.utils.process import SIGNALS
 
 pytestmark = pytest.mark.usefixtures('own_signals')
 

@@ -34,7 +34,7 @@ from kfvo_ros.backbones.base import Window  # noqa: E402
 from kfvo_ros.backbones.vggt.backbone import VggtBackbone  # noqa: E402
 from kfvo_ros.backbones.vggt.config import VggtConfig, config_of  # noqa: E402
 from kfvo_ros.backbones.vggt.model import Vggt  # noqa: E402
-from kfvo_ros.backbones.vggt.precision import set_precision  # noqa: E402
+from kfvo_ros.backbones.vggt.runtime import set_precision  # noqa: E402
 from kfvo_ros.sequences.base import Frame  # noqa: E402
 
 DATA = Path(__file__).with_name('data') / 'vggt'

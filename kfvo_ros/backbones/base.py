@@ -22,7 +22,7 @@ import numpy as np
 
 from kfvo_ros.camera import Camera
 from kfvo_ros.sequences.base import Frame
-from kfvo_ros.tracking import Tracks
+from kfvo_ros.tracking.tracker import Tracks
 
 LOST_VARIANCE = 1e2
 """Variance of each component of a pose that is only a guess."""
@@ -71,7 +71,7 @@ class Points:
 
 
 @dataclass(frozen=True)
-class Previous:
+class WindowPrior:
     """What earlier windows said of this one: a hint that a stateless backbone ignores.
 
     ``T_anchor_frame`` (S - 1, 4, 4) are the keyframes' poses in the present anchor and
@@ -93,7 +93,7 @@ class Window:
 
     stream: Stream
     frames: tuple[Encoded, ...]
-    previous: Previous | None = None
+    previous: WindowPrior | None = None
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ class Estimate:
     ``T_anchor_frame`` (S, 4, 4) float64, the first exactly identity, translations in one
     unit per window; ``make_covariance`` returns what ``covariance`` is; ``points`` or None;
     ``signals`` (len(signal_names),) float32 for the policy; ``status`` of the newest frame;
-    ``memory`` comes back in the next `Previous`; ``intrinsics`` K (3, 3) of the newest image [px]
+    ``memory`` comes back in the next `WindowPrior`; ``intrinsics`` K (3, 3) of the newest image [px]
     from those that estimate them; ``durations`` [s] of parts of the call that people compare,
     such as ``head``, of a batch the window's share.
     """

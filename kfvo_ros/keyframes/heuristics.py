@@ -4,14 +4,19 @@
 
 from __future__ import annotations
 
-from kfvo_ros.keyframes.base import DecisionInput, KeyframePolicy
-from kfvo_ros.tracking import common, mean_flow
+from dataclasses import dataclass
+
+import numpy as np
+
+from kfvo_ros.keyframes.base import DecisionInput, KeyframePolicy, ObservationLayout, indices_of
+from kfvo_ros.tracking.tracker import common, mean_flow
 
 MIN_TRACKS = 8
 """With fewer tracks left since the last keyframe their mean motion means nothing: keep."""
+FLOW, BASELINE, SURVIVAL = 'flow', 'baseline_to_depth', 'track_survival'
 
 
-class Every(KeyframePolicy):
+class EveryFrame(KeyframePolicy):
     """Keep every frame: the paper's VGGT-SW."""
 
     name = 'every'
@@ -56,3 +61,28 @@ class Survival(KeyframePolicy):
             return True
         survived = len(before) / len(decision.keyframe_tracks)
         return survived < self.share and mean_flow(before, after) >= self.min_flow
+
+
+@dataclass(frozen=True)
+class ParallaxRule:
+    """Keeps a frame after enough flow or baseline, or when too few of the tracks are left.
+
+    ``flow`` is the tracks' mean motion since the last keyframe [px], ``baseline`` the camera's by
+    the median depth, ``survival`` the share of that keyframe's tracks which must be left.
+    """
+
+    flow: float
+    baseline: float
+    survival: float
+
+    @staticmethod
+    def unseen_in(layout: ObservationLayout) -> list[str]:
+        """Return the names of what a teacher looks at and an observation does not hold."""
+        return [name for name in (FLOW, BASELINE, SURVIVAL) if (name, 1) not in layout]
+
+    def decide(self, observations: np.ndarray, layout: ObservationLayout) -> np.ndarray:
+        """Return 1 where it keeps, else 0, (N,) for observations (N, D) in this layout."""
+        seen = indices_of(((FLOW, 1), (BASELINE, 1), (SURVIVAL, 1)), layout)
+        flow, baseline, survival = observations[:, seen].T
+        return ((flow > np.log1p(self.flow)) | (baseline > self.baseline)
+                | (survival < self.survival)).astype(np.int64)

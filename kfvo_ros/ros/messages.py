@@ -9,7 +9,12 @@ here, field by field.
 
 from __future__ import annotations
 
+import importlib
+import importlib.util
+import pathlib
+import re
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -21,6 +26,14 @@ from std_msgs.msg import Header
 from kfvo_ros import geometry
 from kfvo_ros.images import decode_compressed, decode_image
 from kfvo_ros.trajectory import NANOSECONDS
+
+RENAMED = {'tf/msg/tfMessage': 'tf2_msgs/msg/TFMessage'}
+"""Types of ROS 1 that ROS 2 has under another name."""
+_KIND = re.compile(r'([a-z]\w*)/msg/([A-Za-z]\w*)', re.ASCII)
+_SEQUENCE = re.compile(r'sequence<(.+?)(?:, \d+)?>')
+_ARRAY = re.compile(r'(.+)(\[\d+\])')
+_BOUNDED_STRING = re.compile(r'(w?string)<\d+>')
+_PRIMITIVES = {'boolean': 'bool', 'octet': 'byte', 'float': 'float32', 'double': 'float64'}
 
 
 def to_array(message: Image | CompressedImage) -> np.ndarray:
@@ -101,3 +114,36 @@ def _vector(values: np.ndarray) -> Vector3:
 def _quaternion(pose: np.ndarray) -> Quaternion:
     x, y, z, w = map(float, geometry.quat_xyzw_from_rotation(pose[:3, :3]))
     return Quaternion(x=x, y=y, z=z, w=w)
+
+
+def find_message_class(kind: str) -> type[Any] | None:
+    """Return the class of a type such as ``sensor_msgs/msg/Image``, or None without one."""
+    found = _KIND.fullmatch(RENAMED.get(kind, kind))
+    if found is None:
+        return None
+    package, name = found.groups()
+    # Nothing is imported because a bag names it, unless it is a package of messages.
+    spec = importlib.util.find_spec(package)
+    folders = spec.submodule_search_locations if spec else None
+    if not any(pathlib.Path(folder, 'msg', '__init__.py').is_file() for folder in folders or ()):
+        return None
+    return getattr(importlib.import_module(f'{package}.msg'), name, None)
+
+
+def message_layout(message_class: Any) -> str:
+    """Return the wire format, in the words of `kfvo_ros.sequences.bag.reader.Bag.layout`."""
+    return ' '.join(map(_describe, message_class.get_fields_and_field_types().values()))
+
+
+def _describe(field: str) -> str:
+    """Return ``uint8[]`` for ``sequence<uint8>``, ``(int32 uint32)`` for a nested Time."""
+    if found := _SEQUENCE.fullmatch(field):
+        return f'{_describe(found[1])}[]'
+    if found := _ARRAY.fullmatch(field):
+        return f'{_describe(found[1])}{found[2]}'
+    if found := _BOUNDED_STRING.fullmatch(field):
+        return found[1]
+    if '/' in field:
+        nested = find_message_class(field.replace('/', '/msg/'))
+        return f'({message_layout(nested) if nested else field})'
+    return _PRIMITIVES.get(field, field)

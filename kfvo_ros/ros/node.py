@@ -13,16 +13,16 @@ from sensor_msgs.msg import CompressedImage, Image
 from std_srvs.srv import SetBool, Trigger
 
 from kfvo_ros import __version__
-from kfvo_ros.assembly import make_backbone
 from kfvo_ros.errors import KfvoError
-from kfvo_ros.options import OdometryOptions, VggtOptions
-from kfvo_ros.ros.camera_source import CameraSource
-from kfvo_ros.ros.following import Following
+from kfvo_ros.odometry.factory import make_backbone
+from kfvo_ros.odometry.options import OdometryOptions, VggtOptions
+from kfvo_ros.ros.diagnostics import SILENCE_S, Diagnostics
 from kfvo_ros.ros.messages import make_header
-from kfvo_ros.ros.monitor import SILENCE_S, Monitor
-from kfvo_ros.ros.outputs import Outputs
-from kfvo_ros.ros.parameters import NodeOptions, read_parameters
+from kfvo_ros.ros.options import NodeOptions
+from kfvo_ros.ros.parameters import read_parameters
 from kfvo_ros.ros.pipeline import Pipeline
+from kfvo_ros.ros.publishers import Publishers
+from kfvo_ros.ros.subscriptions import CameraSource, QosMatchingSubscription
 from kfvo_ros.ros.worker import Worker
 
 NAME = 'kfvo'
@@ -42,14 +42,14 @@ class KfvoNode(Node):
         odometry, vggt, options = read_parameters(self, OdometryOptions, VggtOptions,
                                                   NodeOptions)
         backbone = make_backbone(odometry, vggt)
-        self._monitor = Monitor()  # only now: until here no image could be waited for
+        self._monitor = Diagnostics()  # only now: until here no image could be waited for
         topic = self.resolve_topic_name(options.image_topic)
         cameras = CameraSource(self, topic, options.camera_info_topic, options.camera_info_file)
         self._pipeline = Pipeline(self, backbone, odometry, options, cameras,
-                                  Outputs(self, options), self._monitor)
+                                  Publishers(self, options), self._monitor)
         size = BACKLOG if options.process_every_frame else options.queue_size
         self._worker = Worker(lambda item: self._pipeline.handle(*item), self._pipeline.idle, size)
-        self._images = Following(
+        self._images = QosMatchingSubscription(
             self, CompressedImage if topic.endswith(COMPRESSED) else Image, options.image_topic,
             max(size, 10), self._on_image, options.image_qos)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)

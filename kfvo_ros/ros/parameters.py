@@ -5,55 +5,19 @@
 from __future__ import annotations
 
 import difflib
-from dataclasses import Field, dataclass, fields
+from dataclasses import Field, fields
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
 
 from kfvo_ros.errors import KfvoError
-from kfvo_ros.options import option, type_of
+from kfvo_ros.utils.config import type_of
 
 ROS_OWN = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')
 """Beginnings of the names that rclpy declares itself."""
 NAMES = {bool: 'true or false', int: 'a whole number', float: 'a number', str: 'text'}
 MOST = {int: 2 ** 63 - 1, float: 1e308}
-
-
-@dataclass(frozen=True)
-class NodeOptions:
-    """What the node listens to, and what it says."""
-
-    image_topic: str = option(
-        'image', 'images to follow; remapping image does the same. Ends in /compressed for '
-        'sensor_msgs/CompressedImage')
-    image_qos: str = option(
-        'auto', "reliability of the subscription; auto follows the publisher's",
-        ('auto', 'reliable', 'best_effort'))
-    camera_info_topic: str = option('', 'calibration; empty: camera_info beside the images')
-    camera_info_file: str = option(
-        '', 'calibration file (camera_info.yaml), which wins over the topic')
-    queue_size: int = option(
-        1, 'images that may wait while one is worked on; of more, the oldest are dropped',
-        least=1, most=1000)
-    process_every_frame: bool = option(
-        False, 'drop nothing and lag behind instead, for bags (up to 1000 images)')
-    odom_frame: str = option('odom', 'frame in which poses are given: the base at the first image')
-    base_frame: str = option(
-        '', 'frame whose pose is given, such as base_link; empty: the camera, turned to x '
-        'forward, y left, z up, called <camera frame>_body')
-    base_to_camera: str = option(
-        '', 'where the camera is on the base: "x y z qx qy qz qw"; empty: from TF')
-    camera_frame: str = option('', "optical frame of the camera; empty: the images' frame_id")
-    scale: float = option(
-        1.0, "metres per unit of the trajectory; of the geometric backbone the unit is the first "
-        "scene's median depth",
-        least=1e-9, most=1e9)
-    publish_tf: bool = option(True, 'send the pose as TF too')
-    path_max_length: int = option(1000, 'poses in the path; 0: all', least=0)
-    path_rate: float = option(2.0, 'paths per second at most [Hz]', least=0.01, most=100.0)
-    trajectory_file: str = option(
-        '', 'TUM file that grows as poses become final; a number is added to a name that is taken')
 
 
 def read_parameters(node: Node, *kinds: type[Any]) -> list[Any]:
@@ -72,15 +36,6 @@ def read_parameters(node: Node, *kinds: type[Any]) -> list[Any]:
                 f'unknown parameter {name}: '
                 + (f'is {meant[0]} meant?' if meant else f'expected one of {", ".join(known)}'))
     return options
-
-
-def describe(*kinds: type[Any]) -> str:
-    """Return a text that lists the parameters, their defaults and their meaning."""
-    return '\n'.join(
-        f'  {declared.name}: {declared.metadata["description"]}'
-        + (f' ({", ".join(declared.metadata["choices"])})' if declared.metadata['choices'] else '')
-        + (f' [{declared.default}]' if declared.default not in (None, '') else '')
-        for kind in kinds for declared in fields(kind))
 
 
 def _read(node: Node, kind: type[Any], declared: Field[Any]) -> Any:

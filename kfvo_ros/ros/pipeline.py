@@ -13,20 +13,19 @@ from pathlib import Path
 from rclpy.node import Node
 from sensor_msgs.msg import CompressedImage, Image
 
-from kfvo_ros.assembly import make_odometry
 from kfvo_ros.backbones.base import Backbone
 from kfvo_ros.camera import Camera
 from kfvo_ros.errors import KfvoError, MemoryFullError, reason_of
-from kfvo_ros.live import LiveOdometry
-from kfvo_ros.options import OdometryOptions
-from kfvo_ros.ros.camera_source import CameraSource
+from kfvo_ros.odometry.factory import make_odometry
+from kfvo_ros.odometry.online import OnlineOdometry, TrajectoryLog, free_path
+from kfvo_ros.odometry.options import OdometryOptions
+from kfvo_ros.ros.diagnostics import Diagnostics
 from kfvo_ros.ros.messages import to_array, to_stamp_ns
-from kfvo_ros.ros.monitor import Monitor
-from kfvo_ros.ros.outputs import QUIET_S, Outputs
-from kfvo_ros.ros.parameters import NodeOptions
+from kfvo_ros.ros.options import NodeOptions
+from kfvo_ros.ros.publishers import QUIET_S, Publishers
+from kfvo_ros.ros.subscriptions import CameraSource
 from kfvo_ros.sequences.base import Frame
 from kfvo_ros.trajectory import NANOSECONDS
-from kfvo_ros.trajectory_log import TrajectoryLog, free_path
 
 CALIBRATION_WAIT_S = 0.5
 """An image waits so long for the CameraInfo that was sent with it."""
@@ -43,15 +42,15 @@ class Pipeline:
     """
 
     def __init__(self, node: Node, backbone: Backbone, odometry: OdometryOptions,
-                 options: NodeOptions, cameras: CameraSource, outputs: Outputs,
-                 monitor: Monitor) -> None:
+                 options: NodeOptions, cameras: CameraSource, outputs: Publishers,
+                 monitor: Diagnostics) -> None:
         self._logger = node.get_logger()
         self._odometry_options, self._options = odometry, options
         self._cameras, self._outputs, self._monitor = cameras, outputs, monitor
         self.backbone = backbone
         self.policy_name = make_odometry(odometry, self.backbone).policy.name
         self._lock = threading.Lock()
-        self._live: LiveOdometry | None = None
+        self._live: OnlineOdometry | None = None
         self._seen: tuple[int, int, Camera | None] | None = None
         self._last_ns: int | None = None
         self._log = self._new_log()
@@ -131,7 +130,7 @@ class Pipeline:
         if self._log.problem is not None:
             self._logger.error(str(self._log.problem), once=True)
 
-    def _begin(self, width: int, height: int, camera: Camera | None) -> LiveOdometry:
+    def _begin(self, width: int, height: int, camera: Camera | None) -> OnlineOdometry:
         """Start a segment with this camera."""
         if self._live is not None:
             self._reset('the images have another size' if camera is None else
@@ -141,8 +140,8 @@ class Pipeline:
             f'fx {camera.fx:.1f}, fy {camera.fy:.1f}, {camera.distortion_model} distortion, from '
             f'{self._cameras.name}'))
         self._seen = width, height, camera
-        self._live = LiveOdometry(make_odometry(self._odometry_options, self.backbone), self._log,
-                                  self._options.scale, self._options.path_max_length or None)
+        self._live = OnlineOdometry(make_odometry(self._odometry_options, self.backbone), self._log,
+                                    self._options.scale, self._options.path_max_length or None)
         return self._live
 
     def _reset(self, reason: str) -> None:

@@ -1,12 +1,12 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Publish the messages of a bag when they are due."""
+"""Bag time against the clock on the wall."""
 
 from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from itertools import count
 
 from rclpy.duration import Duration
@@ -18,38 +18,64 @@ from rosgraph_msgs.msg import Clock
 from tqdm import tqdm
 
 from kfvo_ros.errors import KfvoError
-from kfvo_ros.options import PlayOptions
-from kfvo_ros.ros.message_types import find_message_class, layout_of
-from kfvo_ros.ros.pacing import Pacing
-from kfvo_ros.ros.read_ahead import ReadAhead
-from kfvo_ros.sequences.bag_reader import Bag
+from kfvo_ros.ros.messages import find_message_class, message_layout
+from kfvo_ros.ros.options import PlayOptions
+from kfvo_ros.ros.worker import ReadAhead
+from kfvo_ros.sequences.bag.reader import Bag
 from kfvo_ros.trajectory import NANOSECONDS
 
 READ_AHEAD_BYTES = 16 * 1024 * 1024
 DISCOVERY_S = 3.5
 """How long subscribers that run already may take to be found: Fast DDS announces every 3 s."""
-
 SETTLING_S = 0.2
 """From when a publisher has found its subscribers to when they have found it."""
-
 REMINDER_S = 5.0
 ACKNOWLEDGEMENT_S = 5.0
 """Fast DDS asks its readers what they have every 3 s."""
-
 DEPTH = 10
 """Of what is not latched, whatever was recorded: with Fast DDS a deeper queue delays all later
 messages by seconds where one was lost, to send it again."""
-
 LATCHED_DEPTH = 100
 LATE_NS = 50_000_000
 """What is less late is not worth a word."""
-
 LOOP_GAP_S = 0.1
 """Between loops, so that a bag of one message does not become a flood."""
-
 BAR = '{desc}: {percentage:3.0f}%|{bar}| {n:.1f}/{total:.1f} s of the bag'
-
 _log = logging.getLogger(__name__)
+
+
+class PlaybackClock:
+    """Lets bag time pass at a rate; what is late is not waited for, and delays nothing after it.
+
+    `tick` is called with the bag time [ns], `frequency` times a second, during the waits.
+    """
+
+    def __init__(self, rate: float, tick: Callable[[int], None] | None = None,
+                 frequency: float = 1.0) -> None:
+        self._rate, self._tick = rate, tick
+        self._period_ns = round(NANOSECONDS / frequency)
+        self.begin(0)
+
+    def begin(self, bag_time_ns: int) -> None:
+        """Let it be `bag_time_ns` now."""
+        self._from_ns = bag_time_ns
+        self._began_ns = self._next_tick_ns = time.monotonic_ns()
+
+    def wait_for(self, bag_time_ns: int) -> int:
+        """Sleep until it is `bag_time_ns`; return how late it is by then [ns]."""
+        due_ns = self._began_ns + round((bag_time_ns - self._from_ns) / self._rate)
+        while True:
+            now_ns = time.monotonic_ns()
+            wake_ns = due_ns
+            if self._tick is not None:
+                if now_ns >= self._next_tick_ns:
+                    self._tick(self._from_ns + round((now_ns - self._began_ns) * self._rate))
+                    missed = (now_ns - self._next_tick_ns) // self._period_ns
+                    self._next_tick_ns += (missed + 1) * self._period_ns
+                wake_ns = min(due_ns, self._next_tick_ns)
+            if now_ns >= due_ns:
+                return now_ns - due_ns
+            time.sleep(max(wake_ns - now_ns, 0) / NANOSECONDS)
 
 
 def make_node() -> Node:
@@ -69,10 +95,10 @@ class Player:
         self._start_ns, self._stop_ns = _window(bag, options)
         self._publishers = _make_publishers(node, bag, topics, options.clock is not None)
         if options.clock is None:
-            self._pacing = Pacing(options.rate)
+            self._pacing = PlaybackClock(options.rate)
         else:
             self._clock = node.create_publisher(Clock, '/clock', 10)
-            self._pacing = Pacing(options.rate, self._publish_clock, options.clock)
+            self._pacing = PlaybackClock(options.rate, self._publish_clock, options.clock)
         self._latest_ns = 0
         self.count, self.seconds = 0, 0.0
 
@@ -176,7 +202,7 @@ def _make_publishers(node: Node, bag: Bag, topics: Iterable[str],
             problem = '--clock publishes there'
         elif message_class is None:
             problem = 'this ROS installation has no such messages'
-        elif layout is not None and layout != layout_of(message_class):
+        elif layout is not None and layout != message_layout(message_class):
             problem = 'this ROS installation has another definition of them'
         else:
             try:

@@ -11,13 +11,13 @@ import numpy as np
 
 from kfvo_ros.camera import Camera
 from kfvo_ros.errors import KfvoError
-from kfvo_ros.sequences import bag, euroc, folder, kitti, tartanair, tum, video
-from kfvo_ros.sequences.base import Sequence
-from kfvo_ros.sequences.kind import Options
+from kfvo_ros.sequences import euroc, image_folder, kitti, tartanair, tum, video
+from kfvo_ros.sequences.bag import sequence
+from kfvo_ros.sequences.base import Sequence, SequenceSettings
 
 SYNTHETIC = 'synthetic'
 KINDS = {module.KIND.name: module.KIND
-         for module in (euroc, tum, kitti, tartanair, bag, folder, video)}
+         for module in (euroc, tum, kitti, tartanair, sequence, image_folder, video)}
 """Kinds that are paths, in the order in which they are tried."""
 
 
@@ -35,11 +35,11 @@ def open_sequence(text: str, *, kind: str | None = None, camera: Camera | None =
         raise KfvoError(f'unknown kind of sequence {kind!r}; expected one of '
                         f'{", ".join((*KINDS, SYNTHETIC))}')
     if kind == SYNTHETIC or (kind is None and text.startswith(f'{SYNTHETIC}:')):
-        from kfvo_ros.sequences.synthetic import parse_synthetic
+        from kfvo_ros.sequences.synthetic.sequence import parse_synthetic
         return parse_synthetic(text)
     # Absolute, for names like that of '.', but through links: their name may say more.
     path = Path(os.path.abspath(os.path.expanduser(text)))
-    options = Options(camera, image_topic, ground_truth_topic, ground_truth_to_camera, rate)
+    options = SequenceSettings(camera, image_topic, ground_truth_topic, ground_truth_to_camera, rate)
     return KINDS[kind or _detect(path)].open(path, options)
 
 

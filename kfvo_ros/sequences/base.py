@@ -4,17 +4,22 @@
 
 from __future__ import annotations
 
+import logging
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
-from kfvo_ros.camera import Camera
+from kfvo_ros.camera import Camera, guess_camera, read_camera_info
+from kfvo_ros.errors import KfvoError
 from kfvo_ros.trajectory import Trajectory
 
 BODY_FRAME = 'body'
 """The rig that carries the camera, where the source does not name it."""
+CALIBRATION_FILE = 'camera_info.yaml'
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -78,3 +83,87 @@ class Sequence(ABC):
     def extrinsics(self) -> tuple[FixedTransform, ...]:
         """Return what carries the camera: none, or transforms from the body to camera_frame."""
         return ()
+
+
+@dataclass(frozen=True)
+class SequenceSettings:
+    """What a user may say about a sequence; a kind ignores what does not concern it."""
+
+    camera: Camera | None = None
+    """Wins over every calibration that comes with the sequence."""
+
+    image_topic: str | None = None
+    """Which images of a bag."""
+
+    ground_truth_topic: str | None = None
+    """Which measured trajectory of a bag."""
+
+    ground_truth_to_camera: np.ndarray | None = None
+    """T_body_camera (4, 4), body being what the bag's ground truth measured."""
+
+    rate: float = 10.0
+    """Frames per second [Hz] where nothing else gives stamps."""
+
+
+@dataclass(frozen=True)
+class SequenceKind:
+    """One kind of sequence: how it looks, for people and for code, and how to open it."""
+
+    name: str
+    looks_like: str
+    matches: Callable[[Path], bool]
+    open: Callable[[Path, SequenceSettings], Sequence]
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Where the camera of a sequence may come from, in order of precedence.
+
+    ``given`` by the user; CALIBRATION_FILE in ``folder``; ``own(width, height)``, what the
+    dataset itself says, asked only when the first two are absent.
+    """
+
+    given: Camera | None
+    folder: Path
+    own: Callable[[int, int], Camera | None] = lambda width, height: None
+
+    def camera(self, name: str, width: int, height: int) -> Camera:
+        """Return the camera of images of this size; a guess is logged as a warning.
+
+        Raises KfvoError naming the sequence when a calibration is broken or of another shape.
+        """
+        beside = self.folder / CALIBRATION_FILE
+        if self.given is not None:
+            camera = self.given
+        elif beside.is_file():
+            camera = read_camera_info(beside)
+        else:
+            camera = self.own(width, height) or _guess(name, width, height)
+        try:
+            return camera.scaled(width, height)
+        except KfvoError as error:
+            raise KfvoError(f'{name}: {error}') from error
+
+
+def rigid_transform(numbers: object, what: str) -> np.ndarray:
+    """Return T (4, 4) of 16 numbers in rows; KfvoError when they are no rigid transform."""
+    try:
+        transform = np.array(numbers, dtype=np.float64).reshape(4, 4)
+    except (TypeError, ValueError):
+        transform = np.zeros((4, 4))
+    rotation = transform[:3, :3]
+    if not (np.isfinite(transform).all() and np.allclose(transform[3], (0, 0, 0, 1))
+            and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
+            and np.linalg.det(rotation) > 0):
+        found = ' '.join(str(numbers).split())
+        raise KfvoError(f'{what}: expected a rigid 4x4 transform (a rotation, a translation, and '
+                        f'0 0 0 1 below), found {found[:200]}')
+    return transform
+
+
+def _guess(name: str, width: int, height: int) -> Camera:
+    camera = guess_camera(width, height)
+    _log.warning('%s has no calibration: guessing fx = fy = %.0f px for its %dx%d images, which '
+                 'bends the trajectory where it is wrong; give a %s in its folder or --camera',
+                 name, camera.fx, width, height, CALIBRATION_FILE)
+    return camera

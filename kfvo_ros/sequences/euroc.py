@@ -16,16 +16,19 @@ import numpy as np
 from kfvo_ros import geometry
 from kfvo_ros.camera import Camera
 from kfvo_ros.errors import KfvoError
-from kfvo_ros.sequences.base import GroundTruth
-from kfvo_ros.sequences.calibration import Calibration, rigid_transform
-from kfvo_ros.sequences.image_list import ImageListSequence
-from kfvo_ros.sequences.kind import Kind, Options
-from kfvo_ros.text_rows import parse_pose, read_rows
+from kfvo_ros.sequences.base import (
+    Calibration,
+    GroundTruth,
+    SequenceKind,
+    SequenceSettings,
+    rigid_transform,
+)
+from kfvo_ros.sequences.image_folder import ImageListSequence
 from kfvo_ros.trajectory import Trajectory
-from kfvo_ros.yaml_file import read_yaml
+from kfvo_ros.utils.files import parse_pose, read_rows, read_yaml
 
 
-def open_euroc(path: Path, options: Options) -> ImageListSequence:
+def open_euroc(path: Path, options: SequenceSettings) -> ImageListSequence:
     """Open the left camera of a sequence; `path` is mav0 or its parent."""
     root = path / 'mav0' if (path / 'mav0').is_dir() else path
     folder = root.parent if root.name == 'mav0' else root
@@ -41,7 +44,7 @@ def _matches(path: Path) -> bool:
     return any((root / 'cam0' / 'data.csv').is_file() for root in (path, path / 'mav0'))
 
 
-KIND = Kind('euroc', 'EuRoC: a folder with mav0/cam0/data.csv', _matches, open_euroc)
+KIND = SequenceKind('euroc', 'EuRoC: a folder with mav0/cam0/data.csv', _matches, open_euroc)
 
 
 def _parse_image(line: str) -> tuple[int, str]:

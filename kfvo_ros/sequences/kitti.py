@@ -16,18 +16,16 @@ import numpy as np
 from kfvo_ros import geometry
 from kfvo_ros.camera import Camera
 from kfvo_ros.errors import KfvoError
-from kfvo_ros.sequences.base import GroundTruth
-from kfvo_ros.sequences.calibration import Calibration
-from kfvo_ros.sequences.image_list import IMAGE_SUFFIXES, ImageListSequence
-from kfvo_ros.sequences.kind import Kind, Options
-from kfvo_ros.text_rows import parse_floats, read_rows
+from kfvo_ros.sequences.base import Calibration, GroundTruth, SequenceKind, SequenceSettings
+from kfvo_ros.sequences.image_folder import IMAGE_SUFFIXES, ImageListSequence
 from kfvo_ros.trajectory import parse_stamp_ns, read_kitti_poses
+from kfvo_ros.utils.files import parse_floats, read_rows
 
 IMAGE_FOLDERS = {'image_0': 'P0', 'image_2': 'P2'}
 """Image folders by preference (left grey, left colour) and their row of calib.txt."""
 
 
-def open_kitti(path: Path, options: Options) -> ImageListSequence:
+def open_kitti(path: Path, options: SequenceSettings) -> ImageListSequence:
     """Open the left grey camera of a sequence, or the left colour one where that is all."""
     stamps_ns = read_rows(path / 'times.txt', 'seconds', parse_stamp_ns)
     folder = next((path / name for name in IMAGE_FOLDERS if (path / name).is_dir()), None)
@@ -45,8 +43,8 @@ def _matches(path: Path) -> bool:
     return (path / 'times.txt').is_file() and any((path / n).is_dir() for n in IMAGE_FOLDERS)
 
 
-KIND = Kind('kitti', 'KITTI: root/sequences/NN with times.txt and image_0 or image_2', _matches,
-            open_kitti)
+KIND = SequenceKind('kitti', 'KITTI: root/sequences/NN with times.txt and image_0 or image_2', _matches,
+                    open_kitti)
 
 
 def _suffix(folder: Path) -> str:

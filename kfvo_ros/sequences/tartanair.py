@@ -16,21 +16,18 @@ import numpy as np
 from kfvo_ros import geometry
 from kfvo_ros.camera import Camera
 from kfvo_ros.errors import KfvoError
-from kfvo_ros.sequences.base import GroundTruth
-from kfvo_ros.sequences.calibration import Calibration
-from kfvo_ros.sequences.image_list import ImageListSequence, list_images, stamps_at_rate
-from kfvo_ros.sequences.kind import Kind, Options
-from kfvo_ros.text_rows import parse_pose, read_rows
+from kfvo_ros.sequences.base import Calibration, GroundTruth, SequenceKind, SequenceSettings
+from kfvo_ros.sequences.image_folder import ImageListSequence, list_images, stamps_at_rate
 from kfvo_ros.trajectory import Trajectory
+from kfvo_ros.utils.files import parse_pose, read_rows
 
 CAMERA = Camera(640, 480, 320.0, 320.0, 320.0, 240.0)
 """The one camera of the whole dataset."""
-
 R_NED_OPTICAL = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 """The dataset's camera looks along x with z down; an optical frame along z with y down."""
 
 
-def open_tartanair(path: Path, options: Options) -> ImageListSequence:
+def open_tartanair(path: Path, options: SequenceSettings) -> ImageListSequence:
     """Open the left camera of a trajectory folder, stamped at the rate of the options."""
     folder = path / 'image_left'
     stamp_of = stamps_at_rate(options.rate)
@@ -45,8 +42,8 @@ def _matches(path: Path) -> bool:
     return (path / 'image_left').is_dir() and (path / 'pose_left.txt').is_file()
 
 
-KIND = Kind('tartanair', 'TartanAir V1: .../P000 with image_left and pose_left.txt', _matches,
-            open_tartanair)
+KIND = SequenceKind('tartanair', 'TartanAir V1: .../P000 with image_left and pose_left.txt', _matches,
+                    open_tartanair)
 
 
 def _read_ground_truth(path: Path, stamps_ns: np.ndarray) -> GroundTruth | None:

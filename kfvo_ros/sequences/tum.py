@@ -13,18 +13,15 @@ from functools import partial
 from pathlib import Path
 
 from kfvo_ros.camera import Camera
-from kfvo_ros.sequences.base import GroundTruth
-from kfvo_ros.sequences.calibration import Calibration
-from kfvo_ros.sequences.image_list import ImageListSequence
-from kfvo_ros.sequences.kind import Kind, Options
-from kfvo_ros.text_rows import read_rows
+from kfvo_ros.sequences.base import Calibration, GroundTruth, SequenceKind, SequenceSettings
+from kfvo_ros.sequences.image_folder import ImageListSequence
 from kfvo_ros.trajectory import parse_stamp_ns, read_tum
+from kfvo_ros.utils.files import read_rows
 
 KINECT_READOUT = 0.030
 """The colour sensor is read row by row over nearly the whole interval of 33 ms (Ringaby and
 Forssen, "Scan rectification for structured light range sensors with rolling shutters", ICCV
 2011)."""
-
 FREIBURG = {
     '1': Camera(640, 480, 517.306408, 516.469215, 318.643040, 255.313989, 'plumb_bob',
                 (0.262383, -0.953104, -0.005358, 0.002628, 1.163314), readout_s=KINECT_READOUT),
@@ -35,7 +32,7 @@ FREIBURG = {
 """The colour cameras of freiburg1, 2 and 3; the third's images are rectified."""
 
 
-def open_tum(path: Path, options: Options) -> ImageListSequence:
+def open_tum(path: Path, options: SequenceSettings) -> ImageListSequence:
     """Open the colour camera of a sequence folder."""
     images = read_rows(path / 'rgb.txt', 'timestamp filename', _parse_image)
     return ImageListSequence(path.name, path, images,
@@ -43,8 +40,8 @@ def open_tum(path: Path, options: Options) -> ImageListSequence:
                              partial(_read_ground_truth, path / 'groundtruth.txt'))
 
 
-KIND = Kind('tum', 'TUM RGB-D: a folder with rgb.txt', lambda path: (path / 'rgb.txt').is_file(),
-            open_tum)
+KIND = SequenceKind('tum', 'TUM RGB-D: a folder with rgb.txt', lambda path: (path / 'rgb.txt').is_file(),
+                    open_tum)
 
 
 def _parse_image(line: str) -> tuple[int, str]:

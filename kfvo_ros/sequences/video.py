@@ -11,10 +11,8 @@ from pathlib import Path
 import cv2
 
 from kfvo_ros.errors import KfvoError
-from kfvo_ros.sequences.base import Frame, Sequence
-from kfvo_ros.sequences.calibration import Calibration
-from kfvo_ros.sequences.image_list import stamps_at_rate
-from kfvo_ros.sequences.kind import Kind, Options
+from kfvo_ros.sequences.base import Calibration, Frame, Sequence, SequenceKind, SequenceSettings
+from kfvo_ros.sequences.image_folder import stamps_at_rate
 
 VIDEO_SUFFIXES = frozenset(('.mp4', '.m4v', '.avi', '.mov', '.mkv', '.webm', '.mpg', '.mpeg'))
 
@@ -52,13 +50,13 @@ class VideoSequence(Sequence):
         return self._length if self._length > 0 else None
 
 
-def open_video(path: Path, options: Options) -> VideoSequence:
+def open_video(path: Path, options: SequenceSettings) -> VideoSequence:
     """Open a video file."""
     return VideoSequence(path, Calibration(options.camera, path.parent), options.rate)
 
 
-KIND = Kind('video', f'a video file ({" ".join(sorted(VIDEO_SUFFIXES))})',
-            lambda path: path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES, open_video)
+KIND = SequenceKind('video', f'a video file ({" ".join(sorted(VIDEO_SUFFIXES))})',
+                    lambda path: path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES, open_video)
 
 
 @contextmanager

@@ -13,9 +13,17 @@ from typing import Any
 
 import numpy as np
 
-from kfvo_ros.backbones.geometric.compilation import compiled
-from kfvo_ros.backbones.geometric.problem import NormalEquations, Problem, State
-from kfvo_ros.backbones.geometric.reprojection import MIN_DEPTH, cost, lift, project, seen_by
+from kfvo_ros.backbones.geometric.numba_utils import compiled
+from kfvo_ros.backbones.geometric.reprojection import (
+    MIN_DEPTH,
+    NormalEquations,
+    Problem,
+    State,
+    cost,
+    lift,
+    project,
+    seen_by,
+)
 from kfvo_ros.backbones.geometric.schur import add_products, dot, step
 
 FIRST_DAMPING, LEAST_DAMPING = 1e-4, 1e-7

@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 import poselib
 
-from kfvo_ros import geometry, track_ids
-from kfvo_ros.backbones.base import Previous
-from kfvo_ros.backbones.geometric import kernels, medians
+from kfvo_ros import geometry
+from kfvo_ros.backbones.base import WindowPrior
+from kfvo_ros.backbones.geometric import numba_utils, triangulation
 from kfvo_ros.backbones.geometric.bundle_adjustment import LEAST_INVERSE_DEPTH
-from kfvo_ros.backbones.geometric.memory import History, memory_of
-from kfvo_ros.backbones.geometric.observations import Observations
-from kfvo_ros.backbones.geometric.problem import State
+from kfvo_ros.backbones.geometric.keyframe_history import HistoryFrames, history_of
+from kfvo_ros.backbones.geometric.observations import TrackTable
+from kfvo_ros.backbones.geometric.reprojection import State
+from kfvo_ros.tracking import tracker
 
 MIN_PAIR_TRACKS = 12
 """Two frames with fewer common tracks cannot start a window."""
@@ -35,7 +36,6 @@ MAX_SPREAD = 0.7
 """... and when one pixel moves them by less than this share of the median."""
 LEAST_COSINE = 1e-3
 """Points at a steeper angle to the optical axis are not in front of a camera."""
-
 RELATIVE_POSE = {'max_epipolar_error': 1.0, 'max_iterations': 500, 'min_iterations': 20}
 ABSOLUTE_POSE = {'max_reproj_error': 3.0, 'max_iterations': 200, 'min_iterations': 5}
 REFINEMENT = {'max_iterations': 5}
@@ -63,7 +63,7 @@ class Initialiser:
         self._camera = {'model': 'SIMPLE_PINHOLE', 'width': 1, 'height': 1,
                         'params': [focal, 0.0, 0.0]}
 
-    def best_pair(self, observations: Observations) -> tuple[int, int] | None:
+    def best_pair(self, observations: TrackTable) -> tuple[int, int] | None:
         """Return the two frames whose relative pose is best determined, by tracks and flow.
 
         None when the camera did not move.
@@ -84,7 +84,7 @@ class Initialiser:
                     best, pair = score, (i, j)
         return pair
 
-    def from_nothing(self, observations: Observations, pair: tuple[int, int] | None) -> Guess:
+    def from_nothing(self, observations: TrackTable, pair: tuple[int, int] | None) -> Guess:
         """Return poses and depths of a window of which nothing is known, median depth 1.
 
         The `best_pair` of frames gives the first two poses, the others are resected one by one
@@ -109,7 +109,7 @@ class Initialiser:
         state = state.scaled(float(np.median(state.points[2])))
         return Guess(state, np.ones(len(observations)), np.zeros(len(observations), dtype=bool))
 
-    def from_previous(self, observations: Observations, previous: Previous, history: History,
+    def from_previous(self, observations: TrackTable, previous: WindowPrior, history: HistoryFrames,
                       by_epipolar_geometry: bool = False) -> Guess:
         """Return the poses and depths known from earlier windows, and a place for the new frame.
 
@@ -128,8 +128,8 @@ class Initialiser:
         state = self._complete(observations, T_anchor_frame, known)
         return _guess(observations, previous, state, known)
 
-    def from_history(self, observations: Observations, previous: Previous,
-                     history: History) -> Guess:
+    def from_history(self, observations: TrackTable, previous: WindowPrior,
+                     history: HistoryFrames) -> Guess:
         """Return poses resected from what history and anchor see, which are final, and no other.
 
         What the last window took for motion of its frames, and for depths, is not built on:
@@ -144,7 +144,7 @@ class Initialiser:
         state = self._complete(observations, T_anchor_frame, np.full(len(observations), np.nan))
         return _guess(observations, previous, state, known)
 
-    def _relative_pose(self, observations: Observations, i: int, j: int) -> np.ndarray:
+    def _relative_pose(self, observations: TrackTable, i: int, j: int) -> np.ndarray:
         """Return T_i_j with a translation of length 1."""
         both = observations.mask[:, i] & observations.mask[:, j]
         pose, _ = poselib.estimate_relative_pose(
@@ -155,7 +155,7 @@ class Initialiser:
         T_i_j[:3, 3] /= length if length > 0.0 else 1.0
         return T_i_j
 
-    def _step(self, observations: Observations, T_anchor_frame: np.ndarray,
+    def _step(self, observations: TrackTable, T_anchor_frame: np.ndarray,
               inverse_depths: np.ndarray, visible: np.ndarray) -> np.ndarray:
         """Return T_anchor_newest from the relative pose to the frame before it.
 
@@ -170,9 +170,9 @@ class Initialiser:
         T_keyframe_newest = self._relative_pose(observations, keyframe, newest)
         T_newest_keyframe = geometry.invert(T_keyframe_newest)
         T_keyframe_frame = geometry.relative(T_anchor_frame[keyframe], T_anchor_frame)
-        X = kernels.place(*_rotations_and_translations(T_keyframe_frame),
-                          observations.hosts[visible], observations.rays[visible],
-                          inverse_depths[visible])
+        X = triangulation.point_positions(*_rotations_and_translations(T_keyframe_frame),
+                                          observations.hosts[visible], observations.rays[visible],
+                                          inverse_depths[visible])
         x = np.column_stack([observations.seen[visible, newest], np.ones(visible.sum())])
         turned = np.cross(x, X @ T_newest_keyframe[:3, :3].T)
         moved = np.cross(x, T_newest_keyframe[:3, 3])
@@ -180,7 +180,7 @@ class Initialiser:
         T_keyframe_newest[:3, 3] *= max(float(np.median(lengths)), 0.0)
         return T_anchor_frame[keyframe] @ T_keyframe_newest
 
-    def _resect_in_turn(self, observations: Observations, T_w_frame: np.ndarray,
+    def _resect_in_turn(self, observations: TrackTable, T_w_frame: np.ndarray,
                         placed: np.ndarray, frame: int, fallback: np.ndarray) -> np.ndarray:
         """Return T_w_frame of one more frame from points that two placed frames see."""
         mask = observations.mask & placed
@@ -190,13 +190,13 @@ class Initialiser:
         hosts = mask[rows].argmax(axis=1)
         rays = np.ones((len(rows), 3))
         rays[:, :2] = observations.seen[rows, hosts]
-        part = Observations(observations.ids[rows], observations.seen[rows], mask[rows], hosts,
-                            rays, observations.certainty[rows])
+        part = TrackTable(observations.ids[rows], observations.seen[rows], mask[rows], hosts,
+                          rays, observations.certainty[rows])
         inverse_depths, _ = _triangulate(part, T_w_frame)
         return self._resect(part, T_w_frame, inverse_depths,
                             inverse_depths > LEAST_INVERSE_DEPTH, frame, fallback)
 
-    def _resect(self, observations: Observations, T_w_frame: np.ndarray,
+    def _resect(self, observations: TrackTable, T_w_frame: np.ndarray,
                 inverse_depths: np.ndarray, usable: np.ndarray, frame: int,
                 fallback: np.ndarray) -> np.ndarray:
         """Return T_w_frame of `frame` from points of known depth."""
@@ -204,9 +204,9 @@ class Initialiser:
             return fallback
         rows = np.flatnonzero(usable)
         rows = rows[::math.ceil(len(rows) / ENOUGH_POINTS)]
-        positions = kernels.place(*_rotations_and_translations(T_w_frame),
-                                  observations.hosts[rows], observations.rays[rows],
-                                  inverse_depths[rows])
+        positions = triangulation.point_positions(*_rotations_and_translations(T_w_frame),
+                                                  observations.hosts[rows], observations.rays[rows],
+                                                  inverse_depths[rows])
         pose, info = poselib.estimate_absolute_pose(
             self.focal * observations.seen[rows, frame], positions, self._camera,
             ABSOLUTE_POSE | {'seed': self._seed}, REFINEMENT)
@@ -214,14 +214,14 @@ class Initialiser:
             return fallback
         return _inverse_of(pose)
 
-    def _complete(self, observations: Observations, T_anchor_frame: np.ndarray,
+    def _complete(self, observations: TrackTable, T_anchor_frame: np.ndarray,
                   inverse_depths: np.ndarray) -> State:
         """Return the state with unknown (NaN) inverse depths triangulated, or the median's."""
         unknown = ~np.isfinite(inverse_depths)
         triangulated, weights = _triangulate(observations, T_anchor_frame)
         believed = triangulated > LEAST_INVERSE_DEPTH
         reference = triangulated[believed] if unknown.all() else inverse_depths[~unknown]
-        median = medians.median(reference) if len(reference) else 1.0
+        median = numba_utils.median(reference) if len(reference) else 1.0
         believed &= ((triangulated > LEAST_SHARE * median)
                      & (triangulated < LARGEST_SHARE * median))
         believed &= self.focal * np.sqrt(weights) * MAX_SPREAD * median > 1.0
@@ -230,27 +230,27 @@ class Initialiser:
                      np.stack([*observations.rays[:, :2].T, filled]))
 
 
-def _poses_before(previous: Previous, history: History) -> np.ndarray:
+def _poses_before(previous: WindowPrior, history: HistoryFrames) -> np.ndarray:
     """Return where earlier windows had history and frames, the new one where the camera was."""
     return np.concatenate([history.T_anchor_view, previous.T_anchor_frame,
                            previous.T_anchor_latest[None]])
 
 
-def _guess(observations: Observations, previous: Previous, state: State,
+def _guess(observations: TrackTable, previous: WindowPrior, state: State,
            known: np.ndarray) -> Guess:
     """Return the start, with what earlier windows let expect: inverse depths (P,) or NaN."""
-    measured = track_ids.present(observations.ids, memory_of(previous).trusted)
+    measured = tracker.present(observations.ids, history_of(previous).trusted)
     return Guess(state, _expect(observations, known, state.points[2]),
                  np.isfinite(known) & measured)
 
 
-def known_inverse_depths(observations: Observations, T_anchor_frame: np.ndarray,
-                         previous: Previous) -> np.ndarray:
+def known_inverse_depths(observations: TrackTable, T_anchor_frame: np.ndarray,
+                         previous: WindowPrior) -> np.ndarray:
     """Return inverse depths (P,) in the hosts of points known before, NaN for new ones."""
     inverse_depths = np.full(len(observations), np.nan)
     if previous.points is None:
         return inverse_depths
-    rows, known = track_ids.shared(observations.ids, previous.points.ids)
+    rows, known = tracker.shared(observations.ids, previous.points.ids)
     hosts = observations.hosts[rows]
     towards = previous.points.positions[known] - T_anchor_frame[hosts, :3, 3]
     depths = (T_anchor_frame[hosts, :3, 2] * towards).sum(axis=1)
@@ -259,28 +259,28 @@ def known_inverse_depths(observations: Observations, T_anchor_frame: np.ndarray,
     return inverse_depths
 
 
-def _expect(observations: Observations, known: np.ndarray, filled: np.ndarray) -> np.ndarray:
+def _expect(observations: TrackTable, known: np.ndarray, filled: np.ndarray) -> np.ndarray:
     """Return known inverse depths, and for new points those of their neighbours in the image.
 
     A new point is most likely as far as what is known around it in the newest frame; where
     nothing is, as the scene's median.
     """
     is_known = np.isfinite(known)
-    median = medians.median(known[is_known] if is_known.any() else filled)
+    median = numba_utils.median(known[is_known] if is_known.any() else filled)
     expected = np.where(is_known, known, median)
     visible = observations.mask[:, -1]
     old, new = np.flatnonzero(is_known & visible), np.flatnonzero(~is_known & visible)
     if len(old) >= NEIGHBOURS and len(new):
         points = observations.seen[:, -1]
-        expected[new] = kernels.medians_of_nearest(points[new], points[old], known[old],
-                                                   NEIGHBOURS)
+        expected[new] = numba_utils.medians_of_nearest(points[new], points[old], known[old],
+                                                       NEIGHBOURS)
     return expected
 
 
-def _triangulate(observations: Observations,
+def _triangulate(observations: TrackTable,
                  T_anchor_frame: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return kernels.triangulate(*_rotations_and_translations(T_anchor_frame), observations.hosts,
-                               observations.rays, observations.seen, observations.mask)
+    return triangulation.triangulate(*_rotations_and_translations(T_anchor_frame), observations.hosts,
+                                     observations.rays, observations.seen, observations.mask)
 
 
 def _rotations_and_translations(transforms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

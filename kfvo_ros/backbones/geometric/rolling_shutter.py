@@ -16,10 +16,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kfvo_ros import motion_field, track_ids
 from kfvo_ros.camera import Camera
-from kfvo_ros.motion_field import MotionField
-from kfvo_ros.tracking import Tracks
+from kfvo_ros.tracking import motion_field, tracker
+from kfvo_ros.tracking.motion_field import MotionField
+from kfvo_ros.tracking.tracker import Tracks
 from kfvo_ros.trajectory import NANOSECONDS
 
 MAX_GAP_NS = 200_000_000
@@ -42,7 +42,7 @@ class RollingShutter:
         last_field, self._last_field = self._last_field, None
         if last is None or not 0 < stamp_ns - last[0] <= MAX_GAP_NS:
             return tracks.pixels
-        now, before = track_ids.shared(tracks.ids, last[1].ids)
+        now, before = tracker.shared(tracks.ids, last[1].ids)
         motion = tracks.pixels[now] - last[1].pixels[before]
         # A point that moved down was read later in its frame, so it had more time to move.
         rows_s = self.camera.readout_s * motion[:, 1:] / self.camera.height

@@ -14,8 +14,8 @@ import math
 
 import numpy as np
 
-from kfvo_ros.backbones.geometric.compilation import compiled
-from kfvo_ros.backbones.geometric.problem import NormalEquations
+from kfvo_ros.backbones.geometric.numba_utils import compiled
+from kfvo_ros.backbones.geometric.reprojection import NormalEquations
 
 TINY = 1e-9
 

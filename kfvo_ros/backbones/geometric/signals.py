@@ -4,15 +4,17 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from kfvo_ros import geometry
-from kfvo_ros.backbones.geometric import kernels
-from kfvo_ros.backbones.geometric.observations import Observations, View
+from kfvo_ros.backbones.geometric.numba_utils import compiled, median
+from kfvo_ros.backbones.geometric.observations import FrameTracks, TrackTable
+from kfvo_ros.backbones.geometric.triangulation import rotate
 from kfvo_ros.backbones.geometric.window import Solution
-from kfvo_ros.tracking import common, mean_flow
+from kfvo_ros.tracking.tracker import common, mean_flow
 
 SIGNAL_NAMES = ('track_survival', 'flow', 'parallax', 'gap', 'baseline_to_depth', 'rotation',
                 'inlier_share', 'depth_information')
@@ -20,8 +22,56 @@ HELD_PARALLAX = 1.0
 """With less parallax to every keyframe of the window a frame tells nothing of translation [px]."""
 
 
+@compiled
+def _unit_ray(seen):
+    length = math.sqrt(seen[0] * seen[0] + seen[1] * seen[1] + 1.0)
+    return seen[0] / length, seen[1] / length, 1.0 / length
+
+
+@compiled
+def correlate(seen, mask, first):
+    """Return sums (F - 1 - first, 3, 3) of ray_newest ray_frame^T of common tracks, unit rays.
+
+    One for each frame from `first` on but the newest.
+    """
+    points, frames = mask.shape
+    sums = np.zeros((frames - 1 - first, 3, 3))
+    for k in range(points):
+        if mask[k, -1]:
+            newest = _unit_ray(seen[k, -1])
+            for frame in range(first, frames - 1):
+                if mask[k, frame]:
+                    ray = _unit_ray(seen[k, frame])
+                    for a in range(3):
+                        for b in range(3):
+                            sums[frame - first, a, b] += newest[a] * ray[b]
+    return sums
+
+
+@compiled
+def median_shifts(seen, mask, first, rotations):
+    """Return medians (F - 1 - first,) of |ray_newest - rotation ray_frame| of common tracks.
+
+    One for each frame from `first` on but the newest; 0 without common tracks.
+    """
+    points, frames = mask.shape
+    medians, shifts = np.zeros(frames - 1 - first), np.zeros(points)
+    for frame in range(first, frames - 1):
+        count = 0
+        for k in range(points):
+            if mask[k, -1] and mask[k, frame]:
+                newest, ray = _unit_ray(seen[k, -1]), _unit_ray(seen[k, frame])
+                x, y, z = rotate(rotations[frame - first], ray[0], ray[1], ray[2])
+                shifts[count] = math.sqrt((newest[0] - x) ** 2 + (newest[1] - y) ** 2
+                                          + (newest[2] - z) ** 2)
+                count += 1
+        if count > 0:
+            medians[frame - first] = median(shifts[:count])
+    return medians
+
+
 @dataclass(frozen=True)
-class Motion:
+class NewestMotion:
     """How the newest frame moved against the last keyframe, and against the whole window.
 
     Parallax is what the best rotation leaves of the flow: a wrong translation cannot feign it.
@@ -39,25 +89,25 @@ class Motion:
     gap: int
 
 
-def measure_motion(solution: Solution, keyframe: View, newest: View, focal: float) -> Motion:
+def measure_motion(solution: Solution, keyframe: FrameTracks, newest: FrameTracks, focal: float) -> NewestMotion:
     """Compare the newest frame with the last keyframe and with the whole window."""
     before, after = common(keyframe.tracks, newest.tracks)
     observations, last = solution.observations, solution.observations.mask.shape[1] - 2
     parallax = float(focal * _shifts(observations, last)[0])
     held = bool(parallax < HELD_PARALLAX  # Most frames need not be compared with all the others.
                 and focal * _shifts(observations, solution.anchor).max() < HELD_PARALLAX)
-    return Motion(len(before) / max(len(keyframe.tracks), 1), mean_flow(before, after),
-                  parallax, held, newest.index - keyframe.index)
+    return NewestMotion(len(before) / max(len(keyframe.tracks), 1), mean_flow(before, after),
+                        parallax, held, newest.index - keyframe.index)
 
 
-def _shifts(observations: Observations, first: int) -> np.ndarray:
+def _shifts(observations: TrackTable, first: int) -> np.ndarray:
     """Return what rotation leaves of the newest frame's flow against each from `first` on."""
     seen, mask = observations.seen, observations.mask
-    rotations = geometry.nearest_rotation(kernels.correlate(seen, mask, first))
-    return np.asarray(kernels.median_shifts(seen, mask, first, rotations))
+    rotations = geometry.nearest_rotation(correlate(seen, mask, first))
+    return np.asarray(median_shifts(seen, mask, first, rotations))
 
 
-def signals(solution: Solution, motion: Motion) -> np.ndarray:
+def signals(solution: Solution, motion: NewestMotion) -> np.ndarray:
     """Return (len(SIGNAL_NAMES),) float32; pixels and information as log(1 + x), angles [rad]."""
     poses = solution.T_anchor_frame
     T_keyframe_newest = geometry.relative(poses[-2], poses[-1])

@@ -11,13 +11,13 @@ from functools import cached_property, partial
 import numpy as np
 
 from kfvo_ros import geometry
-from kfvo_ros.backbones.base import Points, Previous
+from kfvo_ros.backbones.base import Points, WindowPrior
 from kfvo_ros.backbones.geometric import bundle_adjustment as ba
-from kfvo_ros.backbones.geometric import kernels, medians, reprojection
+from kfvo_ros.backbones.geometric import numba_utils, reprojection, triangulation
 from kfvo_ros.backbones.geometric.initialisation import Guess, Initialiser
-from kfvo_ros.backbones.geometric.memory import History, memory_of
-from kfvo_ros.backbones.geometric.observations import Observations
-from kfvo_ros.backbones.geometric.problem import Problem, State
+from kfvo_ros.backbones.geometric.keyframe_history import HistoryFrames, history_of
+from kfvo_ros.backbones.geometric.observations import TrackTable
+from kfvo_ros.backbones.geometric.reprojection import Problem, State
 from kfvo_ros.backbones.geometric.schur import depth_information, reduce
 
 ITERATIONS, FINAL_ITERATIONS = 3, 4
@@ -59,7 +59,7 @@ class Solution:
     The mask of ``problem`` (F, P) is what is left of the observations.
     """
 
-    observations: Observations
+    observations: TrackTable
     anchor: int
     problem: Problem
     state: State
@@ -94,12 +94,12 @@ class Solution:
     @cached_property
     def median_information(self) -> float:
         """Median information of the points' depths, 0 without points."""
-        return medians.median(self.points.information) if len(self.points.ids) else 0.0
+        return numba_utils.median(self.points.information) if len(self.points.ids) else 0.0
 
     @cached_property
     def median_depth(self) -> float:
         """Median distance of the points from the anchor, 1 without points."""
-        return medians.median(self.points.depths) if len(self.points.ids) else 1.0
+        return numba_utils.median(self.points.depths) if len(self.points.ids) else 1.0
 
     @cached_property
     def noise(self) -> float:
@@ -114,9 +114,9 @@ class Solution:
         information = depth_information(ba.linearise(given_poses, self.state, False, np.float64))
         x, y, r = (part[rows] for part in self.state.points)
         origins = self.problem.origins
-        positions = kernels.place(origins[:, :3, :3].copy(), origins[:, :3, 3].copy(),
-                                  self.problem.hosts[rows],
-                                  np.stack([x, y, np.ones(len(rows))], axis=1), r)
+        positions = triangulation.point_positions(origins[:, :3, :3].copy(), origins[:, :3, 3].copy(),
+                                                  self.problem.hosts[rows],
+                                                  np.stack([x, y, np.ones(len(rows))], axis=1), r)
         return Points(self.observations.ids[rows], positions, information[rows] * r ** 2)
 
     def covariance(self) -> np.ndarray:
@@ -136,15 +136,15 @@ class Solution:
         return 0.5 * (covariance + np.swapaxes(covariance, 1, 2))
 
 
-def solve(observations: Observations, initialiser: Initialiser, previous: Previous | None,
-          history: History) -> Solution:
+def solve(observations: TrackTable, initialiser: Initialiser, previous: WindowPrior | None,
+          history: HistoryFrames) -> Solution:
     """Place the frames of a window in the anchor, in the unit of `previous`, else median depth 1.
 
     A draft moves the newest frame alone: the others hardly change. But what the last window found
     may be a wrong minimum. While little is known, a start from nothing competes with it; where
     the window is doubted, one from its history; and these drafts move all frames.
     """
-    anchor, certain = len(history.views), memory_of(previous).certain
+    anchor, certain = len(history.views), history_of(previous).certain
     settled = certain and not history.doubted
     fixed = observations.mask.shape[1] - 1 if settled else anchor + 1
     draft = partial(_draft, observations, initialiser.focal, fixed)
@@ -178,7 +178,7 @@ class _Draft:
         return float(self.inliers[-1].sum()) / max(1, self.problem.mask[-1].sum())
 
 
-def _draft(observations: Observations, focal: float, fixed: int, guess: Guess) -> _Draft:
+def _draft(observations: TrackTable, focal: float, fixed: int, guess: Guess) -> _Draft:
     """Adjust from a guess and tell the outliers: a track that is wrong once has slid before."""
     problem = _problem(observations, focal, guess, fixed)
     state = ba.adjust(problem, guess.state, ITERATIONS)
@@ -189,7 +189,7 @@ def _draft(observations: Observations, focal: float, fixed: int, guess: Guess) -
     return _Draft(problem, state, problem.mask & fits, noise, reprojection.cost(problem, state))
 
 
-def _finish(observations: Observations, draft: _Draft, anchor: int) -> Solution:
+def _finish(observations: TrackTable, draft: _Draft, anchor: int) -> Solution:
     """Adjust again without the outliers, narrowly."""
     problem = draft.problem._replace(mask=draft.inliers, width=NARROW * draft.noise,
                                      fixed=anchor + 1)
@@ -199,7 +199,7 @@ def _finish(observations: Observations, draft: _Draft, anchor: int) -> Solution:
 
 def _noise(problem: Problem, errors: np.ndarray) -> float:
     """Return the median of errors (F, P), had they not been fitted; 1 without any [px]."""
-    typical, count = medians.median_where(errors, problem.mask)
+    typical, count = numba_utils.median_where(errors, problem.mask)
     if not count:
         return 1.0
     fitted = 3 * problem.mask.any(axis=0).sum() + 6 * (len(problem.mask) - problem.fixed)
@@ -207,11 +207,11 @@ def _noise(problem: Problem, errors: np.ndarray) -> float:
     return max(LEAST_NOISE, typical / math.sqrt(left))
 
 
-def _problem(observations: Observations, focal: float, guess: Guess, fixed: int) -> Problem:
+def _problem(observations: TrackTable, focal: float, guess: Guess, fixed: int) -> Problem:
     """Return the bundle adjustment of a window, depths drawn to where they are expected."""
     expected = guess.expected_inverse_depths
     strength = np.where(guess.trusted, TRUSTED_DEPTH_PRIOR, DEPTH_PRIOR)
-    spread = np.maximum(expected, LEAST_PRIOR_SPREAD * medians.median(expected))
+    spread = np.maximum(expected, LEAST_PRIOR_SPREAD * numba_utils.median(expected))
     origins = geometry.make_transform(guess.state.rotations, guess.state.translations)
     return Problem(observations.hosts, origins,
                    np.ascontiguousarray(observations.seen.transpose(1, 2, 0)),

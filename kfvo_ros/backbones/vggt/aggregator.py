@@ -16,13 +16,11 @@ import torch
 from torch import Tensor, nn
 
 from kfvo_ros.backbones.vggt.config import HEAD_SIZE, PATCH, REGISTERS, SPECIAL, VggtConfig
-from kfvo_ros.backbones.vggt.layers import Block
-from kfvo_ros.backbones.vggt.rotary import rotary_of
-from kfvo_ros.backbones.vggt.trunk import Trunk
+from kfvo_ros.backbones.vggt.dinov2 import DinoV2
+from kfvo_ros.backbones.vggt.layers import Block, make_rope
 
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 """Of ImageNet, per channel; not in any checkpoint."""
-
 Grid = tuple[int, int]
 """Rows and columns of an image's patches."""
 
@@ -55,7 +53,7 @@ class Aggregator(nn.Module):
         width = config.width
         self.camera_token = nn.Parameter(torch.zeros(1, len(Role), 1, width))
         self.register_token = nn.Parameter(torch.zeros(1, len(Role), REGISTERS, width))
-        self.patch_embed = Trunk(config)
+        self.patch_embed = DinoV2(config)
         self.frame_blocks, self.global_blocks = (
             nn.ModuleList(Block(width, width // HEAD_SIZE, qk_norm=True)
                           for _ in range(config.depth)) for _ in range(2))
@@ -67,7 +65,7 @@ class Aggregator(nn.Module):
         patches = self.see(images.flatten(0, 1))[:, SPECIAL:]
         roles = [Role.ANCHOR] + [Role.OTHER] * (frames - 1)
         special = self._special()[roles].repeat(batch, 1, 1)
-        within = rotary_of(*grid, like=self.camera_token)
+        within = make_rope(*grid, like=self.camera_token)
         across = within.repeat(frames)
         x = torch.cat([special, patches], dim=1)
         for frame_block, global_block in self._layers():
@@ -82,7 +80,7 @@ class Aggregator(nn.Module):
 
     def first_layer(self, patches: Tensor, grid: Grid, role: Role) -> FirstLayer:
         """Return what the first layer makes of patches (N, h w, width) of frames in one role."""
-        rotary = rotary_of(*grid, like=self.camera_token)
+        rotary = make_rope(*grid, like=self.camera_token)
         special = self._special()[role].expand(len(patches), -1, -1)
         frame_block, global_block = self._layers()[0]
         tokens = frame_block(torch.cat([special, patches], dim=1), rotary)
@@ -92,7 +90,7 @@ class Aggregator(nn.Module):
     def relate(self, first: FirstLayer, grid: Grid) -> Tensor:
         """Return features (B, S, 2 width) of windows, given their first layer (B, S, ...)."""
         batch, frames, _, width = first.tokens.shape
-        within = rotary_of(*grid, like=self.camera_token)
+        within = make_rope(*grid, like=self.camera_token)
         across = within.repeat(frames)
         (_, first_global), *between, (last_frame, last_global) = self._layers()
         x = first_global.complete(*(part.flatten(1, 2) for part in first))

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -14,14 +15,22 @@ import torch
 
 from kfvo_ros import geometry
 from kfvo_ros.backbones.base import Backbone, Encoded, Estimate, Stream, Window, lost
-from kfvo_ros.backbones.vggt import pose_encoding
+from kfvo_ros.backbones.vggt import camera_head
 from kfvo_ros.backbones.vggt.aggregator import grid_of
+from kfvo_ros.backbones.vggt.checkpoint import load_model, locate_weights
 from kfvo_ros.backbones.vggt.config import PATCH, SPECIAL
-from kfvo_ros.backbones.vggt.device_time import DeviceTime
-from kfvo_ros.backbones.vggt.memory import FrameMemory, features_anew, features_reusing
+from kfvo_ros.backbones.vggt.frame_cache import FrameCache, features_cached, features_recomputed
 from kfvo_ros.backbones.vggt.model import Vggt
-from kfvo_ros.backbones.vggt.out_of_memory import memory_bounded
 from kfvo_ros.backbones.vggt.preprocessing import Fit, fit
+from kfvo_ros.backbones.vggt.runtime import (
+    DeviceTime,
+    choose_device,
+    choose_dtype,
+    compile_blocks,
+    compiler_needed,
+    memory_bounded,
+    use_onednn_layout,
+)
 from kfvo_ros.camera import Camera
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.sequences.base import Frame
@@ -32,9 +41,10 @@ TRANSLATION_DOUBT, ROTATION_DOUBT = 0.02, 0.005
 """Standard deviations at least: a share of the distance to the anchor, and radians."""
 LEAST_DOUBT = 1e-3
 """Nor is a translation known better than this share of the window's extent."""
-
 Item = TypeVar('Item')
 Result = TypeVar('Result')
+WARM_UP_SHAPE = (480, 640, 3)
+"""Most cameras' aspect ratio."""
 
 
 class VggtStream(Stream):
@@ -118,7 +128,7 @@ class VggtBackbone(Backbone):
             tokens = self.model.aggregator.see(images)
             descriptors = tokens[:, 0].float().cpu().numpy()
             # Copied: a view would keep the whole batch alive.
-            return [Encoded(frame.stamp_ns, descriptor.copy(), FrameMemory(
+            return [Encoded(frame.stamp_ns, descriptor.copy(), FrameCache(
                         fitted, grid_of(images), image.clone(), patches[None].clone()))
                     for (frame, fitted), descriptor, image, patches in zip(
                         frames, descriptors, images, tokens[:, SPECIAL:])]
@@ -133,7 +143,7 @@ class VggtBackbone(Backbone):
     def _infer(self, windows: Sequence[Window]) -> tuple[np.ndarray, float]:
         """Return the encodings of windows of one size, and how long the head took [s]."""
         frames = [[encoded.payload for encoded in window.frames] for window in windows]
-        features = features_reusing if self.reuse else features_anew
+        features = features_cached if self.reuse else features_recomputed
         with torch.inference_mode(), memory_bounded(self.device):
             seen = features(self.model.aggregator, frames)
             with DeviceTime(self.device) as head:
@@ -162,14 +172,14 @@ def _in_batches(items: Sequence[Item], kind: Callable[[Item], Hashable],
 def _estimate(window: Window, encodings: np.ndarray) -> Estimate:
     """Turn the encodings (iterations, S, 9) of one window into poses in its anchor."""
     with np.errstate(invalid='ignore', divide='ignore'):
-        before, T_camera_world = pose_encoding.transforms(encodings[-2:])
+        before, T_camera_world = camera_head.decode_transforms(encodings[-2:])
     if not np.isfinite(T_camera_world).all():
         return lost(window)
     # The first frame is only nearly the model's world.
     T_anchor_frame = T_camera_world[0] @ geometry.invert(T_camera_world)
     T_anchor_frame[0] = np.eye(4)
     fitted = window.frames[-1].payload.fit
-    K = pose_encoding.intrinsics(encodings[-1], fitted.rows, fitted.width)
+    K = camera_head.decode_intrinsics(encodings[-1], fitted.rows, fitted.width)
     return Estimate(T_anchor_frame, partial(_covariance, before[0] @ geometry.invert(before),
                                             T_anchor_frame),
                     points=None, signals=np.zeros(0, dtype=np.float32),
@@ -191,3 +201,39 @@ def _covariance(before: np.ndarray, T_anchor_frame: np.ndarray) -> np.ndarray:
     deviations = np.repeat(np.column_stack([translation, rotation]), 3, axis=1)
     deviations[0] = 0.0
     return deviations[:, :, None] ** 2 * np.eye(6)
+
+
+def load_backbone(weights: str, revision: str | None, device: str, precision: str,
+                  image_width: int, reuse: bool, window_size: int,
+                  compiled: bool = False) -> VggtBackbone:
+    """Return the backbone with its weights on the device; raises KfvoError.
+
+    On a GPU, or `compiled`, it has placed windows before it is returned: kernels are made, loaded
+    and tuned then, and no frame waits for them.
+    """
+    place = choose_device(device)
+    dtype = choose_dtype(precision, place)
+    path = locate_weights(weights, revision)
+    with memory_bounded(place):
+        model = load_model(path, place, dtype)
+        if compiled:
+            compile_blocks(model)
+        elif place.type == 'cpu':
+            use_onednn_layout(model)
+    logging.getLogger(__name__).info('%s on %s, matrices in %s', path, place, dtype)
+    backbone = VggtBackbone(model, image_width, reuse)
+    if compiled:
+        with compiler_needed():
+            warm_up(backbone, window_size)
+    elif place.type == 'cuda':
+        warm_up(backbone, window_size)
+    return backbone
+
+
+def warm_up(backbone: VggtBackbone, window_size: int) -> None:
+    """Place windows of every size up to `window_size`, as they come at the start."""
+    stream = backbone.open(None)
+    frame = Frame(0, np.zeros(WARM_UP_SHAPE, dtype=np.uint8), None)
+    frames = tuple(stream.encode(frame) for _ in range(window_size))
+    for size in range(2, window_size + 1):
+        backbone.estimate([Window(stream, frames[:size])])

@@ -4,10 +4,12 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from kfvo_ros import geometry
 from kfvo_ros.backbones.vggt.config import CAMERA_HEADS, VggtConfig
 from kfvo_ros.backbones.vggt.layers import Block, LayerNorm, Linear, Mlp
 
@@ -47,3 +49,19 @@ class CameraHead(nn.Module):
             pose = change if pose is None else pose + change
             encodings.append(torch.cat([pose[..., :7], pose[..., 7:].relu()], dim=-1))
         return torch.stack(encodings)
+
+
+def decode_transforms(encodings: np.ndarray) -> np.ndarray:
+    """Return T_camera_world (..., 4, 4), float64, of encodings (..., 9)."""
+    return geometry.transform_from_xyz_quat(np.asarray(encodings, dtype=np.float64)[..., :7])
+
+
+def decode_intrinsics(encodings: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Return K (..., 3, 3) of images (height, width) [px]; a field of view of 0 gives infinity."""
+    fields = np.asarray(encodings, dtype=np.float64)[..., 7:]
+    K = np.zeros((*fields.shape[:-1], 3, 3))
+    with np.errstate(divide='ignore'):
+        K[..., 0, 0] = 0.5 * width / np.tan(0.5 * fields[..., 1])
+        K[..., 1, 1] = 0.5 * height / np.tan(0.5 * fields[..., 0])
+    K[..., 0, 2], K[..., 1, 2], K[..., 2, 2] = 0.5 * width, 0.5 * height, 1.0
+    return K

@@ -1,22 +1,59 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The transformer block that trunk, aggregator and camera head are stacks of.
+"""Rotary position embedding in two dimensions: a token's place turns its queries and keys.
 
-Every layer computes in the type of its own weights and casts what it is given. So the types in
-which weights are stored are the whole precision policy: with matrices in bfloat16, norms and
-scales in float32, the residual stream stays in float32 too, because the scales promote it.
+The first half of a head's channels is turned by the row, the second by the column; within a
+half, channel j is paired with channel j + a quarter of the head ("rotate half").
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from kfvo_ros.backbones.vggt.rotary import Rotary
+from kfvo_ros.backbones.vggt.config import HEAD_SIZE, SPECIAL
 
+ROPE_BASE = 100.0
+"""Wave lengths rise geometrically from 2 pi patches towards BASE times that."""
 QueriesKeysValues = tuple[Tensor, Tensor, Tensor]
 """Each (B, N, heads, channels)."""
+
+
+class Rope(NamedTuple):
+    """Cosine and sine (N, 1, HEAD_SIZE) of the angles of N tokens, the sine with its sign."""
+
+    cos: Tensor
+    sin: Tensor
+
+    def turn(self, x: Tensor) -> Tensor:
+        """Turn queries or keys x (..., N, heads, HEAD_SIZE)."""
+        partner = x.unflatten(-1, (2, 2, -1)).flip(-2).flatten(-3)
+        return torch.addcmul(x * self.cos, partner, self.sin)
+
+    def repeat(self, frames: int) -> Rope:
+        """Return the table of several frames one after the other: they share their places."""
+        return Rope(self.cos.repeat(frames, 1, 1), self.sin.repeat(frames, 1, 1))
+
+
+def make_rope(rows: int, columns: int, like: Tensor) -> Rope:
+    """Return the table of one frame's tokens, in the type and on the device of `like`.
+
+    Special tokens come first and stand at (0, 0), which turns nothing; patches count from 1.
+    """
+    row, column = torch.meshgrid(
+        torch.arange(1, rows + 1, device=like.device),
+        torch.arange(1, columns + 1, device=like.device), indexing='ij')
+    places = torch.stack([row.flatten(), column.flatten()], dim=1).to(like.dtype)
+    places = torch.cat([places.new_zeros(SPECIAL, 2), places])
+    quarter = HEAD_SIZE // 4
+    exponents = torch.arange(quarter, device=like.device, dtype=like.dtype) / quarter
+    angles = places[:, :, None] * ROPE_BASE ** -exponents
+    cos, sin = angles.cos(), angles.sin()
+    return Rope(torch.stack([cos, cos], dim=2).flatten(1)[:, None],
+                torch.stack([-sin, sin], dim=2).flatten(1)[:, None])
 
 
 class Linear(nn.Linear):
@@ -76,7 +113,7 @@ class Attention(nn.Module):
         self.k_norm = LayerNorm(self.channels) if qk_norm else nn.Identity()
         self.proj = Linear(width, width)
 
-    def project(self, x: Tensor, rotary: Rotary | None) -> QueriesKeysValues:
+    def project(self, x: Tensor, rotary: Rope | None) -> QueriesKeysValues:
         """Return what tokens x (B, N, width) ask, answer to, and tell."""
         q, k, v = self._split(self.qkv(x))
         q, k = self.q_norm(q), self.k_norm(k)
@@ -84,7 +121,7 @@ class Attention(nn.Module):
             q, k = rotary.turn(q), rotary.turn(k)
         return q.to(v.dtype), k.to(v.dtype), v
 
-    def project_special(self, special: Tensor, x: Tensor, rotary: Rotary) -> QueriesKeysValues:
+    def project_special(self, special: Tensor, x: Tensor, rotary: Rope) -> QueriesKeysValues:
         """Return the same, but ask only for special tokens (B, M, width), which are not turned."""
         width = x.shape[-1]
         (q,) = self._split(self.qkv.rows(special, 0, width))
@@ -118,11 +155,11 @@ class Block(nn.Module):
         self.mlp = Mlp(width, 4 * width, width)
         self.ls2 = LayerScale(width)
 
-    def forward(self, x: Tensor, rotary: Rotary | None = None) -> Tensor:
+    def forward(self, x: Tensor, rotary: Rope | None = None) -> Tensor:
         """Return tokens (B, N, width) after the block."""
         return self.complete(x, *self.project(x, rotary))
 
-    def project(self, x: Tensor, rotary: Rotary | None = None) -> QueriesKeysValues:
+    def project(self, x: Tensor, rotary: Rope | None = None) -> QueriesKeysValues:
         """Return queries, keys and values of tokens x (B, N, width)."""
         return self.attn.project(self.norm1(x), rotary)
 
@@ -131,7 +168,7 @@ class Block(nn.Module):
         x = x + self.ls1(self.attn(q, k, v))
         return x + self.ls2(self.mlp(self.norm2(x)))
 
-    def special(self, special: Tensor, x: Tensor, rotary: Rotary) -> Tensor:
+    def special(self, special: Tensor, x: Tensor, rotary: Rope) -> Tensor:
         """Return only special tokens (B, M, width) out of tokens x (B, N, width)."""
         return self.complete(special, *self.attn.project_special(
             self.norm1(special), self.norm1(x), rotary))

@@ -4,11 +4,14 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor, nn
 
 from kfvo_ros.backbones.vggt.aggregator import Aggregator
 from kfvo_ros.backbones.vggt.camera_head import CameraHead
 from kfvo_ros.backbones.vggt.config import VggtConfig
+from kfvo_ros.backbones.vggt.layers import LayerNorm, LayerScale
+from kfvo_ros.backbones.vggt.runtime import set_precision
 
 
 class Vggt(nn.Module):
@@ -27,3 +30,18 @@ class Vggt(nn.Module):
     def forward(self, images: Tensor) -> Tensor:
         """Return pose encodings (iterations, B, S, 9) of images (B, S, 3, H, W) in [0, 1]."""
         return self.camera_head(self.aggregator(images))
+
+
+def random_model(device: torch.device, dtype: torch.dtype,
+                 config: VggtConfig | None = None) -> Vggt:
+    """Return a model of random weights, made on `device` without a second copy."""
+    with torch.device('meta'):
+        model = set_precision(Vggt(config), dtype)
+    model = model.to_empty(device=device)
+    for module in model.modules():
+        for name, parameter in module.named_parameters(recurse=False):
+            if isinstance(module, LayerNorm | LayerScale) and name != 'bias':
+                nn.init.constant_(parameter, 1.0 if isinstance(module, LayerNorm) else 0.1)
+            else:
+                nn.init.normal_(parameter, std=0.02)
+    return model.eval().requires_grad_(False)

@@ -1,0 +1,94 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""From options to working parts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from kfvo_ros import geometry
+from kfvo_ros.backbones.base import Backbone
+from kfvo_ros.camera import read_camera_info
+from kfvo_ros.errors import KfvoError
+from kfvo_ros.keyframes.base import KeyframePolicy, layout_of
+from kfvo_ros.keyframes.heuristics import EveryFrame, OpticalFlow, Survival
+from kfvo_ros.keyframes.learned import PolicySignature
+from kfvo_ros.odometry.keyframe_odometry import KeyframeOdometry
+from kfvo_ros.odometry.options import OdometryOptions, SequenceOptions, VggtOptions
+from kfvo_ros.sequences import open_sequence
+from kfvo_ros.sequences.base import Sequence
+
+
+def make_backbone(options: OdometryOptions, vggt: VggtOptions | None = None) -> Backbone:
+    """Return the backbone that `options` name, ready for its first frame; raises KfvoError."""
+    if options.backbone == 'vggt':
+        from kfvo_ros.backbones.vggt.backbone import load_backbone
+        vggt = vggt or VggtOptions()
+        return load_backbone(vggt.weights, vggt.revision, vggt.device, vggt.precision,
+                             vggt.image_width, not vggt.recompute, options.window_size,
+                             vggt.compile)
+    from kfvo_ros.backbones.geometric.backbone import GeometricBackbone
+    return GeometricBackbone(options.seed)
+
+
+def make_policy(options: OdometryOptions, backbone: Backbone) -> KeyframePolicy:
+    """Return the keyframe policy that `options` name, for this backbone; raises KfvoError."""
+    if options.policy is not None and options.keyframes not in (None, 'learned'):
+        raise KfvoError(f'the policy file {options.policy} is for keyframes learned, came '
+                        f'keyframes {options.keyframes}: choose learned, or leave the policy out')
+    if options.keyframes == 'every':
+        return EveryFrame()
+    if options.keyframes == 'optical_flow':
+        return OpticalFlow(options.flow_threshold)
+    if options.keyframes == 'survival':
+        return Survival(options.survival_share)
+    from kfvo_ros.keyframes.learned import find_policy, read_policy
+    path, setting = find_policy(options.policy, backbone.name), signature_of(options, backbone)
+    file = read_policy(path) if path is not None else None
+    unasked = options.keyframes is None and options.policy is None
+    if unasked and (file is None or file.setting.misfit(setting) is not None):
+        return Survival(options.survival_share)
+    if file is None:
+        raise KfvoError(f'no learned policy comes with the {backbone.name} backbone: expected the '
+                        'file of one in policy, none came')
+    return file.policy(setting)
+
+
+def signature_of(options: OdometryOptions, backbone: Backbone) -> PolicySignature:
+    """Return what a learned policy must fit."""
+    return PolicySignature(backbone.name, options.scale_rule or backbone.default_scale_rule,
+                           options.window_size,
+                           layout_of(backbone.descriptor_size, options.window_size,
+                                     backbone.signal_names))
+
+
+def make_odometry(options: OdometryOptions, backbone: Backbone | None = None) -> KeyframeOdometry:
+    """Return the odometry that `options` describe, with a backbone that is there already."""
+    backbone = backbone or make_backbone(options)
+    return KeyframeOdometry(backbone, make_policy(options, backbone), options.scale_rule,
+                            options.window_size)
+
+
+def make_sequence(text: str, options: SequenceOptions) -> Sequence:
+    """Open the sequence; raises KfvoError."""
+    return open_sequence(
+        text, kind=options.kind, image_topic=options.image_topic,
+        camera=read_camera_info(Path(options.camera)) if options.camera else None,
+        ground_truth_topic=options.ground_truth_topic,
+        ground_truth_to_camera=parse_transform(options.ground_truth_to_camera),
+        rate=options.rate)
+
+
+def parse_transform(text: str | None) -> np.ndarray | None:
+    """Return T (4, 4) of ``x y z qx qy qz qw``; raises KfvoError."""
+    if text is None:
+        return None
+    try:
+        numbers = np.array([float(part) for part in text.replace(',', ' ').split()])
+    except ValueError:
+        numbers = np.zeros(0)
+    if len(numbers) != 7 or not np.isfinite(numbers).all() or np.linalg.norm(numbers[3:]) < 1e-3:
+        raise KfvoError(f'expected seven numbers "x y z qx qy qz qw", came {text!r}')
+    return geometry.transform_from_xyz_quat(numbers)

@@ -1,0 +1,87 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Scale of a window against the trajectory so far: the rules `none`, `translation`, `depth`."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kfvo_ros.backbones.base import Estimate, Points, WindowPrior
+from kfvo_ros.tracking import tracker
+
+SCALE_RULES = ('none', 'translation', 'depth')
+MIN_SHARED_POINTS = 8
+"""With fewer points in common their depths do not tell the scale."""
+STANDSTILL = 1e-3
+"""Keyframes closer to the anchor than this share of the window's extent tell no scale."""
+LEAST_AGREEMENT = 0.98
+"""Nor do keyframes whose known and new places agree less, as a cosine: while a camera stands both
+are noise, and a ratio of noise in every window would carry the scale away."""
+
+
+class ScaleAligner:
+    """Trajectory units per unit of a window; remembers the last answer and the scene's depths.
+
+    `rule`: ``none`` trusts the backbone's unit, ``translation`` compares the keyframes' known
+    distances to the anchor with the new ones, ``depth`` compares the depths of shared points
+    and falls back to ``translation`` without them.
+    """
+
+    def __init__(self, rule: str) -> None:
+        self.rule = rule
+        self._last = 1.0
+        self._depths = np.ones(1)
+
+    def align(self, estimate: Estimate, previous: WindowPrior | None) -> float:
+        """Return the factor that brings `estimate` into trajectory units."""
+        if self.rule == 'none':
+            return 1.0
+        if previous is None or (previous.points is None and estimate.points is not None):
+            self._last = self._from_median_depth(estimate.points)
+        else:
+            scale = None
+            if self.rule == 'depth':
+                scale = compare_depths(previous.points, estimate.points)
+            if scale is None:
+                scale = compare_translations(previous.T_anchor_frame, estimate.T_anchor_frame)
+            self._last = self._last if scale is None else scale
+        if estimate.points is not None and len(estimate.points.ids):
+            self._depths = self._last * estimate.points.depths
+        return self._last
+
+    def _from_median_depth(self, points: Points | None) -> float:
+        """Start a segment at the median depth of the last one; the very first at 1."""
+        if points is None or len(points.ids) == 0:
+            return self._last
+        return float(np.median(self._depths) / np.median(points.depths))
+
+
+def compare_depths(known: Points | None, new: Points | None) -> float | None:
+    """Return the information-weighted median ratio of known to new depths."""
+    if known is None or new is None:
+        return None
+    in_known, in_new = tracker.shared(known.ids, new.ids)
+    if len(in_known) < MIN_SHARED_POINTS:
+        return None
+    ratios = known.depths[in_known] / np.maximum(new.depths[in_new], 1e-12)
+    weights = np.minimum(known.information[in_known], new.information[in_new])
+    order = np.argsort(ratios)
+    cumulative = np.cumsum(weights[order])
+    if cumulative[-1] <= 0.0:
+        return None
+    return float(ratios[order[np.searchsorted(cumulative, 0.5 * cumulative[-1])]])
+
+
+def compare_translations(known: np.ndarray, new: np.ndarray) -> float | None:
+    """Return the least-squares ratio of the keyframes' distances to the anchor.
+
+    `known` (S - 1, 4, 4) and `new` (S, 4, 4) are poses in the anchor; None at standstill.
+    """
+    known_places, new_places = known[1:, :3, 3], new[1:len(known), :3, 3]
+    a, b = np.linalg.norm(known_places, axis=1), np.linalg.norm(new_places, axis=1)
+    extent = np.linalg.norm(new[:, :3, 3], axis=1).max()
+    agreement = (known_places * new_places).sum()
+    if (b @ b <= (STANDSTILL * extent) ** 2
+            or agreement <= LEAST_AGREEMENT * np.linalg.norm(a) * np.linalg.norm(b)):
+        return None
+    return float(a @ b / (b @ b))

@@ -1,0 +1,82 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What the node says: Odometry for every image, keyframes, Path now and then, TF."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Odometry, Path
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+
+from kfvo_ros.odometry.base_motion import base_motion, base_pose
+from kfvo_ros.odometry.online import OnlinePose
+from kfvo_ros.ros.frames import BaseFrame, TransformSender
+from kfvo_ros.ros.messages import make_odometry, make_path, make_pose, make_transform
+from kfvo_ros.ros.options import NodeOptions
+
+QUIET_S = 5.0
+"""What is wrong with every image, or keeps every pose back, is logged once in so many seconds."""
+
+
+class Publishers:
+    """Publishes poses of the base, once it is known where the camera is on it."""
+
+    def __init__(self, node: Node, options: NodeOptions) -> None:
+        self._logger = node.get_logger()
+        self._odom_frame = options.odom_frame
+        self._base = BaseFrame(node, options)
+        self._sender = TransformSender(node, options.publish_tf)
+        self._odometry = node.create_publisher(Odometry, '~/odometry', 10)
+        self._keyframe = node.create_publisher(PoseStamped, '~/keyframe', 10)
+        # A viewer that starts later gets the last path at once.
+        self._path = node.create_publisher(
+            Path, '~/path', QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
+        self._path_period_s = 1.0 / options.path_rate
+        self._path_time = -self._path_period_s
+        self._news = False
+        self._T_base_camera: np.ndarray | None = None
+        self._camera_frame = ''
+
+    def publish(self, pose: OnlinePose, camera_frame: str) -> None:
+        """Send one frame's Odometry and transform, and its pose again if it is a keyframe."""
+        self._news = True
+        if camera_frame != self._camera_frame or self._T_base_camera is None:
+            self._mount(camera_frame)
+        if self._T_base_camera is None:
+            self._logger.warning(self._base.problem(camera_frame), throttle_duration_sec=QUIET_S)
+            return
+        motion = base_motion(pose, self._T_base_camera)
+        child = self._base.name(camera_frame)
+        self._odometry.publish(make_odometry(
+            motion.stamp_ns, self._odom_frame, child, motion.T_odom_base, motion.covariance,
+            motion.twist, motion.twist_covariance))
+        if pose.is_keyframe:
+            self._keyframe.publish(make_pose(motion.stamp_ns, self._odom_frame,
+                                             motion.T_odom_base))
+        self._sender.send(make_transform(motion.stamp_ns, self._odom_frame, child,
+                                         motion.T_odom_base))
+
+    def publish_path(self, path: Callable[[], list[tuple[int, np.ndarray]]]) -> None:
+        """Send the camera's `path`, in the base's place, if it is time and somebody looks."""
+        now = time.monotonic()
+        if self._T_base_camera is None or not self._news \
+                or now - self._path_time < self._path_period_s \
+                or self._path.get_subscription_count() == 0:
+            return
+        self._path_time, self._news = now, False
+        T_base_camera = self._T_base_camera
+        self._path.publish(make_path(self._odom_frame, (
+            (stamp_ns, base_pose(pose, T_base_camera)) for stamp_ns, pose in path())))
+
+    def _mount(self, camera_frame: str) -> None:
+        """Look up where this camera is on the base, and say so."""
+        self._camera_frame = camera_frame
+        self._T_base_camera = self._base.transform(camera_frame)
+        if self._T_base_camera is not None:
+            self._logger.info(f'frames: {self._odom_frame} -> {self._base.name(camera_frame)}, '
+                              f'images in {camera_frame}')

@@ -1,0 +1,140 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What the commands share: how their arguments look, and how each of them ends."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+import re
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+
+from kfvo_ros import __version__
+from kfvo_ros.errors import KfvoError, reason_of
+from kfvo_ros.utils.process import raise_on_signals
+
+PIP_NAMES = {'cv2': 'opencv-python-headless', 'mcap': 'mcap', 'numba': 'numba',
+             'numpy': 'numpy', 'poselib': 'poselib', 'rosbags': 'rosbags',
+             'safetensors': 'safetensors', 'threadpoolctl': 'threadpoolctl', 'tqdm': 'tqdm',
+             'yaml': 'PyYAML'}
+"""The modules of setup.py's install_requires, by the name they are imported under."""
+OPTIONAL_PIP_NAMES = {'matplotlib': 'matplotlib', 'torch': 'torch', 'PIL': 'pillow',
+                      'huggingface_hub': 'huggingface-hub', 'gymnasium': 'gymnasium',
+                      'stable_baselines3': 'stable-baselines3', 'tensorboard': 'tensorboard'}
+"""Modules that one command needs: an extra of setup.py brings them."""
+ROS_MODULES = frozenset(('rclpy', 'rcl_interfaces', 'rosgraph_msgs', 'sensor_msgs', 'nav_msgs',
+                         'geometry_msgs', 'diagnostic_msgs', 'std_msgs', 'std_srvs',
+                         'builtin_interfaces'))
+"""What a ROS 2 installation brings; setup.py has it as wheels, under the extra ``ros``."""
+MAX_SEEDS = 10_000
+RANGE = re.compile(r'(synthetic):([0-9]{1,10})-([0-9]{1,10})((?::[a-z]+)?)')
+
+
+def make_parser(command: str, description: str, examples: str = '') -> argparse.ArgumentParser:
+    """Return a parser with ``--version``; description and examples keep their lines."""
+    parser = argparse.ArgumentParser(prog=command, description=description, epilog=examples,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('--version', action='version', version=f'kfvo_ros {__version__}')
+    return parser
+
+
+def run_command(command: str, body: Callable[[list[str]], None], argv: list[str] | None,
+                until_stopped: bool = False) -> int:
+    """Call `body` with the arguments, None for this process's own; return the exit status.
+
+    What a user can meet ends it in one line on stderr and status 1; whatever else is raised is
+    a mistake of ours and keeps its traceback. SIGINT and SIGTERM interrupt it, which is the
+    usual end, of status 0, of a command that runs `until_stopped`.
+    """
+    logging.basicConfig(format=f'{command}: %(levelname)s: %(message)s', level=logging.WARNING)
+    raise_on_signals(even_ignored=until_stopped)
+    try:
+        with _output_written():
+            body(sys.argv[1:] if argv is None else argv)
+        return 0
+    except KeyboardInterrupt:
+        if until_stopped:
+            return 0
+        problem = 'interrupted'
+    except ImportError as error:
+        problem = str(missing_dependency(error))
+    except KfvoError as error:
+        problem = str(error)
+    except MemoryError as error:  # numpy tells for what, Python does not
+        problem = f'out of memory: {error}'.rstrip(': ')
+    except OSError as error:
+        problem = f'{error.filename or ""}: {reason_of(error)}'.lstrip(': ')
+    print(f'{command}: error: {problem}', file=sys.stderr)
+    return 1
+
+
+@contextmanager
+def _output_written() -> Iterator[None]:
+    """Write out what was printed while it can still be told that nobody can take it."""
+    try:
+        yield
+    finally:
+        try:
+            print(end='', flush=True)
+        except OSError:
+            # Python would try again at its exit, and fail with a traceback.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            raise
+
+
+def missing_dependency(error: ImportError) -> KfvoError:
+    """Return the one line to show for a module that is missing, or is there and does not load.
+
+    Raises the error itself when no package of setup.py would bring the module: that is a
+    mistake of ours, not of the installation.
+    """
+    module = (error.name or '').partition('.')[0]
+    problem = 'is missing' if isinstance(error, ModuleNotFoundError) else \
+        f'cannot be imported ({reason_of(error)})'
+    if module in ROS_MODULES:
+        return KfvoError(f"{module} {problem}: source /opt/ros/jazzy/setup.bash, or pip install "
+                         "'kfvo_ros[ros]' where there is none")
+    packages = PIP_NAMES | OPTIONAL_PIP_NAMES
+    if module not in packages:
+        raise error
+    return KfvoError(f'{module} {problem}: pip install {packages[module]}')
+
+
+def parse_names(text: str, what: str, known: Iterable[str]) -> tuple[str, ...]:
+    """Return the names of ``a,b,...``; raises KfvoError for one that is not `known`."""
+    known, names = tuple(known), tuple(dict.fromkeys(text.split(',')))
+    for name in names:
+        if name not in known:
+            raise KfvoError(f'{what}: expected names out of {", ".join(known)}, came {name!r}')
+    return names
+
+
+def parse_numbers(text: str, what: str, least: int = 0) -> tuple[int, ...]:
+    """Return the whole numbers of ``1,2,...``; raises KfvoError for one below `least`."""
+    parts = text.split(',')
+    if not all(part.isascii() and part.isdigit() and int(part) >= least for part in parts):
+        raise KfvoError(f'{what}: expected whole numbers from {least} with commas in between, '
+                        f'came {text!r}')
+    return tuple(dict.fromkeys(map(int, parts)))
+
+
+def expand_ranges(texts: Iterable[str]) -> tuple[str, ...]:
+    """Return the sequences one by one: ``synthetic:A-B`` are the seeds from A to B.
+
+    Raises KfvoError for a range that is empty or too long.
+    """
+    return tuple(text for each in texts for text in _expand_range(each))
+
+
+def _expand_range(text: str) -> list[str]:
+    match = RANGE.fullmatch(text)
+    if match is None:
+        return [text]
+    first, last = int(match[2]), int(match[3])
+    if not 0 <= last - first < MAX_SEEDS:
+        raise KfvoError(f'expected synthetic:A-B[:STYLE] with up to {MAX_SEEDS} seeds from A to '
+                        f'B, came {text!r}')
+    return [f'{match[1]}:{seed}{match[4]}' for seed in range(first, last + 1)]

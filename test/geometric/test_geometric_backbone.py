@@ -1,0 +1,299 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The geometric backbone against its contract and against the truth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from odometry_scenes import (
+    CAMERA,
+    PointCloud,
+    frames_of,
+    moving_poses,
+    run,
+    sure,
+    turning_poses,
+    window,
+)
+
+from kfvo_ros import geometry
+from kfvo_ros.backbones.base import Estimate, Status, Window, WindowPrior
+from kfvo_ros.backbones.geometric.backbone import GeometricBackbone
+from kfvo_ros.errors import KfvoError
+from kfvo_ros.keyframes.heuristics import Survival
+from kfvo_ros.odometry import window_prior
+from kfvo_ros.odometry.keyframe_odometry import KeyframeOdometry
+from kfvo_ros.sequences.synthetic.sequence import SyntheticSequence
+from kfvo_ros.tracking.tracker import common
+
+
+def followed(backbone: GeometricBackbone, poses: np.ndarray, noise: float) -> Window:
+    """Return the window one frame after the first, with what the first one found as a hint."""
+    first = window(poses[:-1], noise=noise, backbone=backbone)
+    estimate = backbone.estimate([first])[0]
+    newest = PointCloud(0, noise=noise).encode(len(poses) - 1, poses[-1])
+    previous = WindowPrior(estimate.T_anchor_frame, estimate.T_anchor_frame[-1], estimate.points,
+                           estimate.memory)
+    return Window(first.stream, (*first.frames, newest), previous)
+
+
+def arrays_of(estimate: Estimate) -> list[np.ndarray]:
+    points = estimate.points
+    return [estimate.T_anchor_frame, estimate.covariance, points.ids, points.positions,
+            points.information, estimate.signals, estimate.memory.T_anchor_view]
+
+
+def assert_same(one: Estimate, other: Estimate) -> None:
+    assert one.status is other.status
+    for a, b in zip(arrays_of(one), arrays_of(other), strict=True):
+        assert a.tobytes() == b.tobytes()
+
+
+def test_a_track_that_is_wrong_once_is_not_believed_at_all():
+    backbone = GeometricBackbone()
+    clean = window(moving_poses(8), backbone=backbone)
+    known = backbone.estimate([clean])[0].points.ids
+    view = clean.frames[3].payload
+    wrong = np.intersect1d(known, view.tracks.ids)[10]
+    assert wrong in clean.frames[5].payload.tracks.ids
+    view.points[view.tracks.ids == wrong] += 5.0 / CAMERA.fx
+    left = backbone.estimate([clean])[0].points.ids
+    assert np.array_equal(left, np.setdiff1d(known, [wrong]))
+
+
+def test_where_nothing_fits_noise_is_no_excuse():
+    """Bounds of outliers that grew with the noise for ever would let everything pass."""
+    backbone = GeometricBackbone()
+    assert backbone.estimate([window(moving_poses(8), 0, 12.0, backbone)])[0].status is Status.LOST
+
+
+def test_many_windows_in_one_call_are_each_alone():
+    backbone = GeometricBackbone()
+    a = window(moving_poses(8), 1, 0.3, backbone)
+    b = followed(backbone, moving_poses(8), 0.3)
+    together = backbone.estimate([a, b])
+    apart = backbone.estimate([a]) + backbone.estimate([b])
+    for one, other in zip(together, apart, strict=True):
+        assert_same(one, other)
+    assert together[0].T_anchor_frame.tobytes() != together[1].T_anchor_frame.tobytes()
+    assert backbone.estimate([]) == []
+
+
+def test_estimate_has_no_side_effects():
+    backbone = GeometricBackbone()
+    hinted = followed(backbone, moving_poses(8), 0.3)
+    inputs = [array.copy() for frame in hinted.frames
+              for array in (frame.payload.points, frame.payload.tracks.pixels)]
+    before = hinted.previous.T_anchor_frame.copy(), hinted.previous.points.positions.copy()
+    first = backbone.estimate([hinted])[0]
+    kept = [array.copy() for array in arrays_of(first)]
+    assert_same(first, backbone.estimate([hinted])[0])
+    for array, copy in zip(arrays_of(first), kept):
+        assert np.array_equal(array, copy)
+    after = [array for frame in hinted.frames
+             for array in (frame.payload.points, frame.payload.tracks.pixels)]
+    assert all(np.array_equal(x, y) for x, y in zip(inputs, after))
+    assert np.array_equal(before[0], hinted.previous.T_anchor_frame)
+    assert np.array_equal(before[1], hinted.previous.points.positions)
+
+
+@pytest.mark.parametrize('frames', [2, 3, 8])
+@pytest.mark.parametrize('hinted', [False, True])
+def test_shapes_and_first_pose(frames, hinted):
+    backbone, poses = GeometricBackbone(), moving_poses(frames + hinted)
+    if hinted:
+        given = followed(backbone, poses, 0.3)
+    else:
+        given = window(poses, noise=0.3, backbone=backbone)
+    estimate, size = backbone.estimate([given])[0], len(poses)
+    assert estimate.T_anchor_frame.shape == (size, 4, 4)
+    assert estimate.T_anchor_frame.dtype == np.float64
+    assert np.array_equal(estimate.T_anchor_frame[0], np.eye(4))
+    rotations = estimate.T_anchor_frame[:, :3, :3]
+    np.testing.assert_allclose(rotations @ np.swapaxes(rotations, 1, 2),
+                               np.tile(np.eye(3), (size, 1, 1)), atol=1e-12)
+    assert estimate.covariance.shape == (size, 6, 6)
+    assert not estimate.covariance[0].any()
+    assert estimate.signals.shape == (len(backbone.signal_names),)
+    assert estimate.signals.dtype == np.float32
+    assert np.isfinite(estimate.signals).all()
+    assert (np.diff(estimate.points.ids) > 0).all()
+    assert (estimate.points.information >= 0.0).all()
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_noise_free_window_is_exact_up_to_scale(seed):
+    poses = moving_poses(8)
+    backbone = GeometricBackbone()
+    estimate = backbone.estimate([window(poses, seed, backbone=backbone)])[0]
+    truth = geometry.relative(poses[0], poses)
+    found = estimate.T_anchor_frame
+    scale = np.linalg.norm(truth[:, :3, 3]) / np.linalg.norm(found[:, :3, 3])
+    np.testing.assert_allclose(found[:, :3, :3], truth[:, :3, :3], atol=2e-3)
+    np.testing.assert_allclose(scale * found[:, :3, 3], truth[:, :3, 3], atol=5e-3)
+    points = PointCloud(seed).points[estimate.points.ids]  # the first camera is the world
+    np.testing.assert_allclose(scale * estimate.points.positions, points, rtol=0.02, atol=0.05)
+    assert estimate.status is Status.OK
+    assert 0.3 < np.median(estimate.points.depths) < 3.0
+
+
+def test_half_a_pixel_of_noise_stays_small():
+    poses, backbone = moving_poses(8), GeometricBackbone()
+    estimate = backbone.estimate([window(poses, noise=0.5, backbone=backbone)])[0]
+    truth, found = geometry.relative(poses[0], poses), estimate.T_anchor_frame
+    scale = np.linalg.norm(truth[:, :3, 3]) / np.linalg.norm(found[:, :3, 3])
+    turned = geometry.rotation_angle(np.swapaxes(truth[:, :3, :3], 1, 2) @ found[:, :3, :3])
+    assert np.degrees(turned).max() < 0.3
+    assert np.linalg.norm(scale * found[:, :3, 3] - truth[:, :3, 3], axis=1).max() < 0.03
+
+
+def test_a_start_before_a_wall_ends_at_the_right_one_of_two_motions():
+    """The first frames fit both; a start at the wrong one is left when later frames tell."""
+    room = SyntheticSequence(77, 'mixed', 20)
+    poses = room.ground_truth().trajectory.poses
+    ended = run(room).poses
+    wrong = geometry.relative(geometry.relative(ended[8], ended[18]),
+                              geometry.relative(poses[8], poses[18]))
+    assert np.degrees(geometry.rotation_angle(wrong[:3, :3])) < 0.5
+
+
+def test_hint_keeps_the_unit_of_the_trajectory():
+    backbone = GeometricBackbone()
+    hinted = followed(backbone, moving_poses(8), 0.2)
+    known = hinted.previous.T_anchor_frame
+    found = backbone.estimate([hinted])[0].T_anchor_frame
+    ratio = np.linalg.norm(found[1:7, :3, 3]) / np.linalg.norm(known[1:, :3, 3])
+    assert abs(np.log(ratio)) < 0.02
+
+
+@pytest.mark.parametrize('noise', [0.0, 0.3])
+def test_covariance_is_symmetric_and_positive(noise):
+    backbone = GeometricBackbone()
+    for poses in (moving_poses(8), turning_poses(8)):
+        covariance = backbone.estimate([window(poses, noise=noise, backbone=backbone)]
+                                       )[0].covariance
+        assert np.array_equal(covariance, np.swapaxes(covariance, 1, 2))
+        values = np.linalg.eigvalsh(covariance)
+        assert (values >= -1e-9 * values.max()).all()
+        assert (values[-1] > 0.0).all()
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_covariance_tells_that_turning_shows_no_scale(seed):
+    """Where it stands a turning camera knows to a share of the depth; of the scale nothing."""
+    backbone = GeometricBackbone()
+    moving, turning = (
+        backbone.estimate([window(poses, seed, 0.3, backbone)])[0]
+        for poses in (moving_poses(8), turning_poses(8)))
+
+    def relative_deviation(estimate):
+        deviation = np.sqrt(np.trace(estimate.covariance[-1, :3, :3]))
+        return deviation / np.linalg.norm(estimate.T_anchor_frame[-1, :3, 3])
+
+    assert relative_deviation(turning) > 1.5 * relative_deviation(moving)
+    assert np.median(turning.points.information) < 0.1 * np.median(moving.points.information)
+
+
+@pytest.mark.parametrize('noise', [0.0, 0.2])
+def test_turning_is_held_and_its_rotation_right(noise):
+    poses, backbone = turning_poses(8), GeometricBackbone()
+    estimate = backbone.estimate([window(poses, noise=noise, backbone=backbone)])[0]
+    assert estimate.status is Status.HELD
+    error = np.swapaxes(poses[:, :3, :3], 1, 2) @ estimate.T_anchor_frame[:, :3, :3]
+    assert np.degrees(geometry.rotation_angle(error)).max() < 0.2
+    assert moving_poses(8)[-1, 0, 3] > 0.5  # the same window moving is not held
+    assert backbone.estimate([window(moving_poses(8), noise=noise, backbone=backbone)]
+                             )[0].status is Status.OK
+
+
+def test_a_frame_at_rest_is_not_held_where_the_window_moved():
+    """There is no parallax to the last keyframe, and enough to those before it."""
+    poses, backbone = moving_poses(8), GeometricBackbone()
+    poses[-1] = poses[-2]
+    estimate = backbone.estimate([window(poses, noise=0.1, backbone=backbone)])[0]
+    assert estimate.signals[GeometricBackbone.signal_names.index('parallax')] < np.log1p(1.0)
+    assert estimate.status is Status.OK
+
+
+@pytest.mark.parametrize('unit', [1e-4, 1e3])
+def test_a_window_is_the_same_in_any_unit(unit):
+    """A camera that starts far above a field lands in it; another starts at a wall."""
+    backbone = GeometricBackbone()
+    window = followed(backbone, moving_poses(8), 0.1)
+    usual = backbone.estimate([window])[0]
+    hint = window.previous
+    elsewhere = replace(window, previous=WindowPrior(
+        window_prior.scale_poses(hint.T_anchor_frame, unit), window_prior.scale_poses(hint.T_anchor_latest, unit),
+        window_prior.transform_points(hint.points, np.eye(4), unit), hint.memory, unit))
+    other = backbone.estimate([elsewhere])[0]
+    np.testing.assert_allclose(window_prior.scale_poses(other.T_anchor_frame, 1.0 / unit),
+                               usual.T_anchor_frame, rtol=0.0, atol=1e-5)
+
+
+def test_a_frame_that_shares_nothing_is_lost_where_it_was():
+    backbone = GeometricBackbone()
+    hinted = followed(backbone, moving_poses(8), 0.2)
+    newest = hinted.frames[-1]
+    others = sure(newest.tracks.ids + 10_000, newest.tracks.pixels)
+    view = type(newest.payload)(7, others, newest.payload.points)
+    strange = type(newest)(newest.stamp_ns, newest.descriptor, view, others)
+    lost = backbone.estimate([Window(hinted.stream, (*hinted.frames[:-1], strange),
+                                     hinted.previous)])[0]
+    assert lost.status is Status.LOST
+    assert np.array_equal(lost.T_anchor_frame[:-1], hinted.previous.T_anchor_frame)
+    assert np.array_equal(lost.T_anchor_frame[-1], hinted.previous.T_anchor_latest)
+    ok = backbone.estimate([hinted])[0]
+    assert np.trace(lost.covariance[-1]) > 100.0 * np.trace(ok.covariance[-1])
+    assert np.isfinite(lost.signals).all()
+    assert len(lost.signals) == len(backbone.signal_names)
+
+
+def test_signals_follow_the_motion():
+    backbone = GeometricBackbone()
+
+    def told(poses):
+        estimate = backbone.estimate([window(poses, noise=0.2, backbone=backbone)])[0]
+        return dict(zip(backbone.signal_names, estimate.signals.tolist(), strict=True))
+
+    slow, fast, turning = told(moving_poses(8, 0.05)), told(moving_poses(8)), told(
+        turning_poses(8))
+    assert fast['flow'] > slow['flow']
+    before, after = common(*(frame.payload.tracks for frame in window(
+        moving_poses(8), noise=0.2, backbone=backbone).frames[-2:]))
+    assert np.expm1(fast['flow']) == pytest.approx(  # as the policy optical_flow sees it
+        np.linalg.norm(after - before, axis=1).mean())
+    assert fast['parallax'] > 2.0 * turning['parallax']
+    assert turning['rotation'] == pytest.approx(
+        geometry.rotation_angle(turning_poses(2)[1, :3, :3]), rel=0.05)
+    assert all(0.0 <= signal['track_survival'] <= 1.0 for signal in (slow, fast, turning))
+    assert fast['gap'] == 1.0
+    assert fast['depth_information'] > turning['depth_information']
+
+
+def test_descriptor_ignores_brightness_and_contrast():
+    backbone, frame = GeometricBackbone(), frames_of(0, 2)[0]
+    brighter = type(frame)(frame.stamp_ns, (frame.image // 2 + 90).astype(np.uint8), frame.camera)
+    one, other = (backbone.open(frame.camera).encode(f).descriptor for f in (frame, brighter))
+    assert one.shape == (backbone.descriptor_size,)
+    assert one.dtype == np.float32
+    assert abs(one.mean()) < 1e-4
+    assert np.abs(one - other).max() < 0.2 * np.abs(one).max()
+
+
+def test_streams_of_one_backbone_do_not_disturb_each_other():
+    backbone = GeometricBackbone()
+    sequences = frames_of(0, 24), frames_of(1, 24)
+    odometries = [KeyframeOdometry(backbone, Survival()) for _ in sequences]
+    interleaved = [[odometry.process(frame).T_world_camera
+                    for odometry, frame in zip(odometries, pair)] for pair in zip(*sequences)]
+    for index, frames in enumerate(sequences):
+        alone = np.stack([update.T_world_camera for update in run(frames).updates])
+        assert np.stack([pair[index] for pair in interleaved]).tobytes() == alone.tobytes()
+
+
+def test_a_camera_is_needed():
+    with pytest.raises(KfvoError, match='calibrated camera'):
+        GeometricBackbone().open(None)

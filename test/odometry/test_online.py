@@ -1,0 +1,104 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Odometry as it runs: its growing trajectory file, its path, and its doubts."""
+
+from __future__ import annotations
+
+import resource
+from functools import cache
+
+import numpy as np
+import pytest
+
+from kfvo_ros import geometry
+from kfvo_ros.errors import KfvoError
+from kfvo_ros.odometry.factory import make_odometry
+from kfvo_ros.odometry.online import LEAST_VARIANCE, OnlineOdometry, TrajectoryLog, free_path
+from kfvo_ros.odometry.options import OdometryOptions
+from kfvo_ros.sequences.base import Frame
+from kfvo_ros.sequences.synthetic.sequence import SyntheticSequence
+from kfvo_ros.trajectory import read_tum
+
+COUNT = 30
+POSES = [geometry.make_transform(geometry.exp_so3(np.array([0.3, -1.2, 0.5]) * index),
+                                 np.array([0.4, -0.2, 1.1]) * index) for index in (1, 2, 3)]
+
+
+@cache
+def make_frames() -> tuple[Frame, ...]:
+    """Render a smooth walk, once."""
+    return tuple(SyntheticSequence(0, 'smooth', COUNT, 320, 240))
+
+
+def test_log_grows_on_disk_and_is_saved_with_what_is_not_final(tmp_path):
+    log = TrajectoryLog(tmp_path / 'new' / 'walk.tum')
+    log.append([(1, POSES[0]), (2, POSES[1])])
+    assert list(read_tum(log.path).stamps_ns) == [1, 2]
+    assert log.save(tmp_path / 'copy.tum', [(3, POSES[2])]) == 3
+    log.append([(4, POSES[0])])  # after a copy it goes on at the end
+    log.close()
+    assert list(read_tum(log.path).stamps_ns) == [1, 2, 4]
+    copy = read_tum(tmp_path / 'copy.tum')
+    assert list(copy.stamps_ns) == [1, 2, 3]
+    np.testing.assert_allclose(copy.poses, POSES, atol=1e-9)
+
+
+def test_log_overwrites_nothing_and_leaves_no_empty_file(tmp_path):
+    taken = tmp_path / 'walk.tum'
+    taken.write_text('mine')
+    for create in (TrajectoryLog, lambda path: TrajectoryLog().save(path, [(1, POSES[0])])):
+        with pytest.raises(KfvoError, match='cannot write the trajectory .*walk.tum'):
+            create(taken)
+        with pytest.raises(KfvoError, match='cannot write the trajectory'):
+            create(taken / 'below' / 'a-file.tum')
+    assert taken.read_text() == 'mine'
+    assert free_path(taken) == tmp_path / 'walk-1.tum'
+    TrajectoryLog(free_path(taken)).close()
+    assert list(tmp_path.iterdir()) == [taken]
+    (tmp_path / 'walk-1.tum').touch()
+    assert free_path(taken) == tmp_path / 'walk-2.tum'
+
+
+def test_log_survives_a_full_disk(tmp_path):
+    """A limit on the size of files stands in for it: writing fails in the same place."""
+    log = TrajectoryLog(tmp_path / 'walk.tum')
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, limits[1]))
+    try:
+        for stamp in range(1, 4):
+            log.append([(stamp, POSES[0])])
+        log.close()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert str(log.problem) == (f'cannot write the trajectory {tmp_path / "walk.tum"}: '
+                                'File too large')
+
+
+def test_path_is_the_newest_of_the_poses_in_metres():
+    whole, short = (OnlineOdometry(make_odometry(OdometryOptions()), TrajectoryLog(), 2.0, length)
+                    for length in (None, 5))
+    for frame in make_frames()[:20]:
+        whole.process(frame)
+        last = short.process(frame)
+        assert len(short.path()) <= 5
+    stamps = [stamp for stamp, _ in whole.path()]
+    assert stamps == [frame.stamp_ns for frame in make_frames()[:20]]
+    assert [stamp for stamp, _ in short.path()] == stamps[-5:]
+    np.testing.assert_allclose(short.path()[-1][1], last.T_world_camera, atol=1e-9)
+
+
+def test_doubt_is_the_backbones_and_what_windows_disagreed_on():
+    """In metres; at first no pose is final, and nothing is known of disagreement."""
+    scale = np.repeat([3.0, 1.0], 3)
+    live = OnlineOdometry(make_odometry(OdometryOptions()), TrajectoryLog(), 3.0)
+    odometry, spreads = make_odometry(OdometryOptions()), []
+    for frame in make_frames():
+        pose, update = live.process(frame), odometry.process(frame)
+        spread, of_motion = (
+            found - np.outer(scale, scale) * given - LEAST_VARIANCE * np.eye(6)
+            for found, given in ((pose.covariance, update.covariance),
+                                 (pose.motion_covariance, update.window_covariance)))
+        np.testing.assert_allclose(spread, of_motion, atol=1e-12)
+        spreads.append(np.linalg.eigvalsh(spread))
+    assert np.abs(spreads[:5]).max() < 1e-12
+    assert min(spreads[-1]) > -1e-12 and max(spreads[-1]) > 1e-6

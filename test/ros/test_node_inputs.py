@@ -1,0 +1,217 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What cameras publish, well or badly, and what kfvo_node makes of it."""
+
+from __future__ import annotations
+
+import time
+
+import cv2
+import numpy as np
+import pytest
+from node_rig import (
+    BEST_EFFORT,
+    HEIGHT,
+    IMAGE,
+    INFO,
+    RELIABLE,
+    WARN,
+    WIDTH,
+    Rig,
+    is_origin,
+    make_frames,
+    sensor_msgs,
+    stamp_ns,
+    stamped,
+    to_image,
+    to_info,
+    to_pose,
+)
+from ros_processes import wait_until
+
+from kfvo_ros import geometry
+from kfvo_ros.camera import write_camera_info
+from kfvo_ros.odometry.base_motion import T_BODY_OPTICAL, base_pose
+from kfvo_ros.odometry.factory import make_odometry
+from kfvo_ros.odometry.options import OdometryOptions
+from kfvo_ros.sequences.base import Frame
+
+FRAMES = make_frames()
+CAMERA = FRAMES[0].camera
+
+
+@pytest.mark.parametrize('qos', [RELIABLE, BEST_EFFORT], ids=['reliable', 'best_effort'])
+@pytest.mark.parametrize('late', [False, True], ids=['before', 'after'])
+def test_a_camera_of_either_reliability_that_starts_before_or_after(qos, late):
+    with Rig(qos=qos, late=late) as rig:
+        if late:
+            time.sleep(0.3)  # it has looked for a publisher in vain
+            rig.start_camera()
+            rig.wait_for_subscriber()
+        reliability = qos.reliability.name.lower()
+        rig.wait_for_line(f'subscribed to {IMAGE} ({reliability}, as its publisher)')
+        rig.send_until_heard(FRAMES[:5])
+        assert is_origin(rig.odometry(1)[0])
+
+
+def test_a_best_effort_camera_joins_a_reliable_one():
+    """What was asked for is lowered while it runs."""
+    with Rig() as rig:
+        rig.drive(FRAMES[:2])
+        rig._qos = BEST_EFFORT
+        rig.start_camera()
+        rig.wait_for_line('subscribing anew')
+        rig.wait_for_line(f'subscribed to {IMAGE} (best_effort, as its publisher')
+        rig.wait_for_subscriber()
+        before = len(rig.odometry())
+        for frame in FRAMES[2:30]:
+            rig.send([frame])
+            time.sleep(0.02)
+        wait_until(lambda: len(rig.odometry()) > before + 3)
+
+
+def test_reliable_asked_of_a_best_effort_camera_tells_the_remedy():
+    with Rig(qos=BEST_EFFORT, late=True, image_qos='reliable') as rig:
+        rig.start_camera()
+        line = rig.wait_for_line('does not offer the reliability')
+        assert '[ERROR]' in line and IMAGE in line and 'set image_qos to auto' in line
+
+
+def test_compressed_images():
+    with Rig(sensor_msgs.CompressedImage, f'{IMAGE}/compressed') as rig:
+        for frame in FRAMES[:6]:
+            rig.info.publish(to_info(CAMERA, frame.stamp_ns))
+            for_sending = sensor_msgs.CompressedImage(
+                format='mono8; png compressed mono8',
+                data=cv2.imencode('.png', frame.image)[1].tobytes())
+            rig.image.publish(stamped(for_sending, frame.stamp_ns))
+        compressed = [to_pose(message.pose.pose) for message in rig.odometry(6)]
+    with Rig() as rig:
+        raw = [to_pose(message.pose.pose) for message in rig.drive(FRAMES[:6])]
+    np.testing.assert_allclose(compressed, raw, atol=1e-9)  # PNG loses nothing
+
+
+def encoded(image: np.ndarray) -> list[tuple[str, np.ndarray, int]]:
+    """Return (encoding, rows of bytes, is big-endian) of a grey image in every encoding."""
+    colour, opaque = np.repeat(image[..., None], 3, 2), np.full((*image.shape, 1), 255, np.uint8)
+    with_alpha, noise = np.concatenate([colour, opaque], 2), image[::-1, ::-1]
+    neutral = np.stack([np.full_like(image, 128), image], 2)
+    little, big = np.stack([noise, image], 2), np.stack([image, noise], 2)
+    rows = [('mono8', image, 0), ('8UC1', image, 0), ('rgb8', colour, 0), ('bgr8', colour, 0),
+            ('rgba8', with_alpha, 0), ('bgra8', with_alpha, 0), ('bayer_rggb8', image, 0),
+            ('bayer_gbrg8', image, 0), ('mono16', little, 0), ('mono16', big, 1),
+            ('16UC1', little, 0), ('yuv422', neutral, 0),
+            ('mono8', np.pad(image, ((0, 0), (0, 24))), 0)]
+    return [(name, pixels.reshape(len(image), -1), big) for name, pixels, big in rows]
+
+
+def test_every_encoding_shows_the_same():
+    """One camera that changes its encoding with every image."""
+    count = len(encoded(FRAMES[0].image))
+    with Rig() as rig:
+        rig.info.publish(to_info(CAMERA))
+        for index, frame in enumerate(FRAMES[:count]):
+            name, rows, is_bigendian = encoded(frame.image)[index]
+            rig.image.publish(to_image(frame.stamp_ns, rows, name, width=WIDTH,
+                                       is_bigendian=is_bigendian))
+        mixed = rig.odometry(count)
+        rig.wait_for_value('images processed', count)
+        values = rig.state()[2]
+        assert (values['images refused'], values['frames lost']) == ('0', '0')
+    assert [stamp_ns(message) for message in mixed] == [
+        frame.stamp_ns for frame in FRAMES[:count]]
+    with Rig() as rig:
+        grey = [to_pose(message.pose.pose)[:3, 3] for message in rig.drive(FRAMES[:count])]
+    positions = np.array([to_pose(message.pose.pose)[:3, 3] for message in mixed])
+    # A mosaic of grey is smoothed, nothing else changes.
+    assert np.abs(positions - grey).max() < 0.05 * np.linalg.norm(grey[-1])
+
+
+def garbage(stamp: int, image: np.ndarray) -> list:
+    """Return images that no driver should send."""
+    return [to_image(stamp, image, **fields) for fields in (
+        {'data': []}, {'encoding': 'nonsense'}, {'encoding': ''}, {'step': 7},
+        {'step': 2 ** 31}, {'width': 0, 'height': 0, 'step': 0, 'data': []}, {'height': 0},
+        {'width': 2 ** 32 - 1}, {'encoding': 'rgb8'}, {'height': HEIGHT + 1})]
+
+
+def test_garbage_is_refused_and_counted_and_good_images_go_on():
+    bad = garbage(FRAMES[3].stamp_ns, FRAMES[3].image)
+    with Rig() as rig:
+        rig.drive(FRAMES[:3])
+        for message in bad:
+            rig.image.publish(message)
+        rig.wait_for_value('images refused', len(bad))
+        level, summary, _ = rig.state()
+        assert level == WARN and 'expected a' in summary
+        assert '[ERROR]' in rig.wait_for_line('[kfvo]: expected a 320x240 mono8 image')
+        after = rig.drive(FRAMES[3:6])
+        assert not is_origin(after[0])  # nothing begins anew
+        rig.wait_for_value('images processed', 6)
+        assert rig.state()[0] == 0
+        # A second image of the same stamp is none.
+        rig.send([FRAMES[5]])
+        rig.wait_for_value('images refused', len(bad) + 1)
+        assert 'have the stamp' in rig.state()[1]
+
+
+def test_another_resolution_begins_anew():
+    large = [Frame(frame.stamp_ns, cv2.resize(frame.image, (2 * WIDTH, 2 * HEIGHT)),
+                   CAMERA.scaled(2 * WIDTH, 2 * HEIGHT)) for frame in FRAMES[6:10]]
+    with Rig() as rig:
+        rig.drive(FRAMES[:6])
+        messages = rig.drive(large)
+        assert [is_origin(message) for message in messages] == [True, False, False, False]
+        rig.wait_for_line('starting anew at the origin: the calibration changed')
+        rig.wait_for_line('images of 640x480, fx 400.0')
+        rig.wait_for_value('resets', 1)
+
+
+def test_without_calibration_it_tells_both_remedies_and_waits():
+    with Rig() as rig:
+        rig.send(FRAMES[:3], with_info=False)
+        line = rig.wait_for_line('no calibration')
+        assert INFO in line and 'camera_info_topic' in line and 'camera_info_file' in line
+        rig.wait_for_value('images refused', 3)
+        assert rig.state()[0] == WARN and not rig.odometry()
+        uncalibrated = to_info(CAMERA)
+        uncalibrated.k = np.zeros(9)
+        rig.info.publish(uncalibrated)
+        time.sleep(0.2)
+        rig.send(FRAMES[3:4], with_info=False)
+        rig.wait_for_value('images refused', 4)
+        assert 'uncalibrated' in rig.state()[1]
+        rig.info.publish(to_info(CAMERA))
+        time.sleep(0.2)
+        rig.send(FRAMES[4:6], with_info=False)
+        assert [stamp_ns(message) for message in rig.odometry(2)] == [
+            frame.stamp_ns for frame in FRAMES[4:6]]
+
+
+def test_a_calibration_file_wins_over_the_topic(tmp_path):
+    write_camera_info(tmp_path / 'camera.yaml', CAMERA)
+    with Rig(camera_info_file=tmp_path / 'camera.yaml') as rig:
+        rig.send(FRAMES[:4], with_info=False)
+        assert len(rig.odometry(4)) == 4
+        assert str(tmp_path / 'camera.yaml') in rig.wait_for_line('images of 320x240')
+        assert rig.info.get_subscription_count() == 0
+
+
+def test_rectified_images_are_those_of_p_without_distortion():
+    """K and D are those of the raw image, and R says how it was turned."""
+    info = to_info(CAMERA)
+    info.k = np.diag([1.5, 1.4, 1.0]).dot(CAMERA.matrix).ravel()
+    info.d = [-0.3, 0.1, 0.01, -0.01, 0.0]
+    info.r = geometry.exp_so3(np.array([0.02, -0.03, 0.01])).ravel()
+    found = {}
+    for topic in ('/camera/image_rect', IMAGE):
+        with Rig(topic=topic) as rig:
+            rig.info.publish(info)
+            rig.send(FRAMES[:8], with_info=False)
+            found[topic] = [to_pose(message.pose.pose) for message in rig.odometry(8)]
+            rig.wait_for_line('none distortion' if 'rect' in topic else 'plumb_bob distortion')
+    odometry = make_odometry(OdometryOptions())
+    ideal = [base_pose(odometry.process(frame).T_world_camera, T_BODY_OPTICAL)
+             for frame in FRAMES[:8]]
+    np.testing.assert_allclose(found['/camera/image_rect'], ideal, atol=1e-9)
+    assert np.abs(np.array(found[IMAGE]) - ideal).max() > 1e-3  # so much K and D would change

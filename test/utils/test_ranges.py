@@ -1,0 +1,24 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Ranges of rendered sequences."""
+
+from __future__ import annotations
+
+import pytest
+
+from kfvo_ros.errors import KfvoError
+from kfvo_ros.sequences import open_sequence
+from kfvo_ros.utils.commands import MAX_SEEDS, expand_ranges
+
+
+def test_a_range_is_every_seed_in_it():
+    texts = expand_ranges(['synthetic:8-10:fast', 'a/path-3-4', 'synthetic:7', 'synthetic:2-2'])
+    assert texts == ('synthetic:8:fast', 'synthetic:9:fast', 'synthetic:10:fast', 'a/path-3-4',
+                     'synthetic:7', 'synthetic:2')
+    assert open_sequence(texts[0]).name == 'synthetic:8:fast'
+
+
+@pytest.mark.parametrize('text', ['synthetic:4-3', f'synthetic:0-{MAX_SEEDS}'])
+def test_empty_and_endless_ranges_are_refused(text):
+    with pytest.raises(KfvoError, match=f'expected synthetic:A-B.*{text}'):
+        expand_ranges([text])
