@@ -1,8 +1,9 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""``python benchmarks/node.py``: does the node keep up, and what when it cannot?
+"""``python benchmarks/node.py``: latency, losses and memory of the node at and above capacity.
 
-A room rendered at EuRoC's 752x480 goes to the node at 20 Hz, then at twice the rate it can take.
+The node receives a rendered room at EuRoC's 752x480, first at 20 Hz, then at twice the rate that
+it can process.
 """
 
 from __future__ import annotations
@@ -17,20 +18,21 @@ import numpy as np
 from kfvo_ros.ros.end_to_end import NodeRun, run_node
 from kfvo_ros.utils.commands import make_parser, run_command
 
+COMMAND = 'benchmarks/node.py'
 RATE_HZ, RENDERED_HZ = 20.0, 30.0
 WIDTH, HEIGHT, SEED = 752, 480, 8
 OFFLINE_FRAMES = 300
-WARM_S = 60
-"""By then the node has all the memory that it needs: what comes later is a leak."""
+WARM_UP_S = 60
+"""Time in which the node allocates all memory it needs: later growth is a leak."""
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run the benchmark; return its exit status."""
-    return run_command('kfvo_node_benchmark', _run, argv)
+    return run_command(COMMAND, _run, argv)
 
 
 def _run(argv: list[str]) -> None:
-    parser = make_parser('kfvo_node_benchmark', __doc__ or '')
+    parser = make_parser(COMMAND, __doc__ or '')
     parser.add_argument('--seconds', type=float, default=60.0, help='length of the stream '
                         '(default: %(default)s)')
     arguments = parser.parse_args(argv)
@@ -39,7 +41,19 @@ def _run(argv: list[str]) -> None:
 
 
 def _compare(bag: Path, count: int) -> None:
-    """Record the stream, run it offline and through the node, and print what came of it."""
+    """Record `count` frames, run them offline and through the node, and print the results."""
+    topic = _record(bag, count)
+    fast, paced = _time_offline(bag, 0.0), _time_offline(bag, 1.0 / RATE_HZ)
+    overload_hz = 2e3 / float(np.median(fast))
+    regular = run_node(bag, topic, {}, RATE_HZ / RENDERED_HZ)
+    overloaded = run_node(bag, topic, {}, overload_hz / RENDERED_HZ)
+    print()
+    print(_format_result('20 Hz', count, paced, regular, RATE_HZ))
+    print(_format_result('twice capacity', count, fast, overloaded, overload_hz))
+
+
+def _record(bag: Path, count: int) -> str:
+    """Record `count` rendered frames; return the topic of the images."""
     from tqdm import tqdm
 
     from kfvo_ros.sequences.bag.recorder import Recorder
@@ -50,20 +64,13 @@ def _compare(bag: Path, count: int) -> None:
     for frame in tqdm(sequence, total=count, unit='frame', desc='rendering'):
         recorder.write(frame)
     recorder.finish(complete=True)
-    hurried, paced = _time_offline(bag, 0.0), _time_offline(bag, 1.0 / RATE_HZ)
-    twice_hz = 2e3 / float(np.median(hurried))
-    usual = run_node(bag, sequence.topic, {}, RATE_HZ / RENDERED_HZ)
-    flooded = run_node(bag, sequence.topic, {}, twice_hz / RENDERED_HZ)
-    print()
-    for name, offline, heard, rate in (('20 Hz', paced, usual, RATE_HZ),
-                                       ('twice capacity', hurried, flooded, twice_hz)):
-        print(_line(name, count, offline, heard, rate))
+    return sequence.topic
 
 
 def _time_offline(bag: Path, period_s: float) -> np.ndarray:
-    """Return the milliseconds that frames of the bag take without ROS, one each `period_s`.
+    """Return the time per frame of the bag without ROS [ms], with a pause of `period_s` between.
 
-    A processor that may rest between frames is slower at each: that is not the node's doing.
+    A processor that idles between frames is slower at each, with or without the node.
     """
     from kfvo_ros.odometry.factory import make_odometry
     from kfvo_ros.odometry.options import OdometryOptions
@@ -80,17 +87,18 @@ def _time_offline(bag: Path, period_s: float) -> np.ndarray:
     return np.array(durations)
 
 
-def _line(name: str, sent: int, offline: np.ndarray, heard: NodeRun, rate: float) -> str:
-    """Return what came of one stream; every image must be accounted for."""
-    unaccounted = sent - heard.missed - heard.dropped - len(heard.stamps_ns)
-    median, p95 = np.percentile(offline, [50, 95])
-    return (f'{name} ({rate:.1f} Hz): {sent} images, {heard.missed} lost in transit, '
-            f'{heard.received} received, {heard.dropped} dropped, {len(heard.stamps_ns)} poses, '
-            f'{unaccounted} unaccounted for; latency {heard.latency_median_ms:.1f} ms (95 %: '
-            f'{heard.latency_p95_ms:.1f}), offline {median:.1f} ms (95 %: {p95:.1f}): '
-            f'{heard.latency_median_ms - median:+.1f} ms; memory '
-            f'{heard.memory_mb[:WARM_S][-1]:.0f} MiB within {WARM_S} s, '
-            f'{heard.memory_mb[-1]:.0f} at the end')
+def _format_result(name: str, sent: int, offline_ms: np.ndarray, run: NodeRun,
+                   rate_hz: float) -> str:
+    """Return the result of one stream in one line; every image must be accounted for."""
+    unaccounted = sent - run.lost_in_transit - run.dropped - len(run.stamps_ns)
+    median, p95 = np.percentile(offline_ms, [50, 95])
+    return (f'{name} ({rate_hz:.1f} Hz): {sent} images, {run.lost_in_transit} lost in transit, '
+            f'{run.received} received, {run.dropped} dropped, {len(run.stamps_ns)} poses, '
+            f'{unaccounted} unaccounted for; latency {run.latency_median_ms:.1f} ms (95 %: '
+            f'{run.latency_p95_ms:.1f}), offline {median:.1f} ms (95 %: {p95:.1f}): '
+            f'{run.latency_median_ms - median:+.1f} ms; memory '
+            f'{run.memory_mb[:WARM_UP_S][-1]:.0f} MiB within {WARM_UP_S} s, '
+            f'{run.memory_mb[-1]:.0f} at the end')
 
 
 if __name__ == '__main__':

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """``python -m kfvo_ros.benchmark SEQUENCE... --output DIR``: the paper's tables.
 
-Every method on every sequence with every seed, each as `python -m kfvo_ros.run` in a process of
-its own; then the tables of the paper, with its own numbers beside those measured here.
+Runs every method on every sequence with every seed, each as `python -m kfvo_ros.run` in a process
+of its own; then writes the paper's tables, with its numbers beside those measured here.
 """
 
 from __future__ import annotations
@@ -24,10 +24,8 @@ from kfvo_ros.utils.config import add_arguments, from_arguments, option
 
 if TYPE_CHECKING:
     from kfvo_ros.evaluation.plan import BenchmarkPlan
-    from kfvo_ros.evaluation.records import Row
+    from kfvo_ros.evaluation.records import Evaluator, Row
     from kfvo_ros.evaluation.runner import Run
-    from kfvo_ros.evaluation.scoring import Evaluator
-
 
 EXAMPLES = """examples:
   python -m kfvo_ros.benchmark synthetic:0-4:smooth --output results
@@ -36,22 +34,23 @@ EXAMPLES = """examples:
   python -m kfvo_ros.benchmark EuRoC/* --backbone vggt --scale none --output results
 """
 RESULTS = 'results.csv'
-ANSWERED = ('keyframes', 'seed')
-"""Options of an odometry that methods and seeds stand for."""
+PLANNED = ('keyframes', 'seed')
+"""Odometry options that follow from --methods and --seeds."""
 
 
 @dataclass(frozen=True)
 class BenchmarkOptions:
-    """What is compared, and how."""
+    """Benchmark options."""
 
     methods: str | None = option(None, f'keyframe policies out of {",".join(POLICIES)}; default: '
-                                 'all, learned if a policy is named or comes along')
+                                 'all but parallax, learned if a policy is named or comes with '
+                                 'the backbone')
     seeds: str = option('0', 'seeds of each method on each sequence, such as 0,1,2')
     jobs: int = option(1, 'runs side by side; they slow each other down, and the table of times '
                        'says how many there were', least=1, most=256)
-    resume: bool = option(False, 'go on: what is finished is not run again')
-    overwrite: bool = option(False, 'begin anew where there are results')
-    no_pictures: bool = option(False, 'draw nothing, which needs no matplotlib')
+    resume: bool = option(False, 'continue: skip the runs that are finished')
+    overwrite: bool = option(False, 'replace existing results')
+    no_pictures: bool = option(False, 'write no plots; needs no matplotlib')
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -64,89 +63,96 @@ def _benchmark(argv: list[str]) -> None:
     arguments = _parse(argv)
     options = from_arguments(BenchmarkOptions, arguments)
     if not options.no_pictures:
-        import matplotlib  # noqa: F401  what is missing is told before hours of runs
-    from kfvo_ros.evaluation.scoring import Evaluator
-    from kfvo_ros.evaluation.sequences import open_benchmark_sequences
-    plan = _plan(arguments, options)
-    _check(plan.folder, options)
-    runs = plan.runs(open_benchmark_sequences(plan.sequences, plan.reading))
+        import matplotlib  # noqa: F401  a missing module fails here, not after hours of runs
+    from kfvo_ros.evaluation.plan import open_benchmark_sequences
+    from kfvo_ros.evaluation.records import Evaluator
+    plan = _make_plan(arguments, options)
+    _prepare_folder(plan.folder, options)
+    runs = plan.runs(open_benchmark_sequences(plan.sequences, plan.sequence_options))
     finished = [run for run in runs if options.resume and run.is_finished()]
-    examiner = Evaluator(plan.reading)
-    rows = _go_through(plan, runs, finished, examiner)
-    _report(plan, runs, rows, examiner, not options.no_pictures)
+    evaluator = Evaluator(plan.sequence_options)
+    rows = _execute(plan, runs, finished, evaluator)
+    _report(plan, runs, rows, evaluator, with_plots=not options.no_pictures)
 
 
-def _plan(arguments: argparse.Namespace, options: BenchmarkOptions) -> BenchmarkPlan:
-    """Return what is asked for; raises KfvoError for what cannot be."""
-    from kfvo_ros.evaluation.plan import BenchmarkPlan, default_methods, fitting_policy
+def _make_plan(arguments: argparse.Namespace, options: BenchmarkOptions) -> BenchmarkPlan:
+    """Return the plan; raises KfvoError for methods, seeds or a policy that are not valid."""
+    from kfvo_ros.evaluation.plan import BenchmarkPlan, check_policy, default_methods
     from kfvo_ros.utils.commands import expand_ranges
     odometry = from_arguments(OdometryOptions, arguments)
     methods = parse_names(options.methods, 'methods', POLICIES) if options.methods \
         else default_methods(odometry)
-    return BenchmarkPlan(tuple(arguments.sequence), expand_ranges(arguments.sequence), methods,
-                         parse_numbers(options.seeds, 'seeds'), odometry,
-                         from_arguments(VggtOptions, arguments), from_arguments(SequenceOptions, arguments),
-                         options.jobs, Path(arguments.output).expanduser(),
-                         fitting_policy(methods, odometry))
+    return BenchmarkPlan(
+        sequence_arguments=tuple(arguments.sequence),
+        sequences=expand_ranges(arguments.sequence),
+        methods=methods,
+        seeds=parse_numbers(options.seeds, 'seeds'),
+        odometry=odometry,
+        vggt=from_arguments(VggtOptions, arguments),
+        sequence_options=from_arguments(SequenceOptions, arguments),
+        jobs=options.jobs,
+        folder=Path(arguments.output).expanduser(),
+        policy_sha256=check_policy(methods, odometry))
 
 
-def _check(folder: Path, options: BenchmarkOptions) -> None:
-    """Make the folder; raises KfvoError where there are results nobody wants to lose."""
+def _prepare_folder(folder: Path, options: BenchmarkOptions) -> None:
+    """Create the folder; raises KfvoError where results would be lost."""
     from kfvo_ros.evaluation.plan import RUNS
-    taken = [name for name in (RESULTS, RUNS) if (folder / name).exists()]
-    if taken and not (options.resume or options.overwrite):
-        raise KfvoError(f'{folder} already holds {", ".join(taken)}; choose another --output, or '
-                        'add --resume to go on or --overwrite to begin anew')
+    existing = [name for name in (RESULTS, RUNS) if (folder / name).exists()]
+    if existing and not (options.resume or options.overwrite):
+        raise KfvoError(f'{folder} already holds {", ".join(existing)}; choose another --output, '
+                        'or add --resume to continue or --overwrite to replace them')
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise KfvoError(f'cannot write to {folder}: {reason_of(error)}') from error
 
 
-def _go_through(plan: BenchmarkPlan, runs: Sequence[Run], finished: Sequence[Run],
-                examiner: Evaluator) -> list[Row]:
-    """Run what is not finished; return all rows in order, which results.csv has as they come."""
+def _execute(plan: BenchmarkPlan, runs: Sequence[Run], finished: Sequence[Run],
+             evaluator: Evaluator) -> list[Row]:
+    """Execute all but the finished runs and return all rows in order.
+
+    results.csv gets each row as its run ends.
+    """
     from tqdm import tqdm
 
-    from kfvo_ros.evaluation.records import append_rows, in_order, write_rows
+    from kfvo_ros.evaluation.records import append_rows, sort_rows, write_rows
     from kfvo_ros.evaluation.runner import run_in_parallel
     path, done = plan.folder / RESULTS, {run.folder for run in finished}
-    rows = [row for run in finished for row in examiner.rows(run, None)]
+    rows = [row for run in finished for row in evaluator.rows(run, None)]
     write_rows(path, rows)
     with tqdm(total=len(runs), initial=len(finished), unit='run') as bar:
-        def ended(run: Run, problem: str | None) -> None:
-            """Take in what came of a run, at once."""
-            new = examiner.rows(run, problem)
+        def on_end(run: Run, problem: str | None) -> None:
+            """Append the rows of a run, and print its problem."""
+            new = evaluator.rows(run, problem)
             append_rows(path, new)
             rows.extend(new)
             bar.update()
             if problem is not None:
-                bar.write(f'{run.subject.name}, {run.method}, seed {run.seed}: {problem}',
+                bar.write(f'{run.sequence.name}, {run.method}, seed {run.seed}: {problem}',
                           file=sys.stderr)
 
         try:
-            run_in_parallel([run for run in runs if run.folder not in done], plan.jobs, ended)
+            run_in_parallel([run for run in runs if run.folder not in done], plan.jobs, on_end)
         except KeyboardInterrupt as interruption:
             raise KfvoError(f'interrupted after {bar.n} of {len(runs)} runs, which are in {path}; '
-                            '--resume goes on') from interruption
-    rows = in_order(rows, tuple(dict.fromkeys(run.subject.name for run in runs)), plan.methods)
+                            '--resume continues') from interruption
+    rows = sort_rows(rows, tuple(dict.fromkeys(run.sequence.name for run in runs)), plan.methods)
     write_rows(path, rows)
     return rows
 
 
-def _report(plan: BenchmarkPlan, runs: Sequence[Run], rows: Sequence[Row], examiner: Evaluator,
-            with_pictures: bool) -> None:
-    """Write the pages, and say what came of it; raises KfvoError where all failed."""
+def _report(plan: BenchmarkPlan, runs: Sequence[Run], rows: Sequence[Row], evaluator: Evaluator,
+            with_plots: bool) -> None:
+    """Write the report and print the ATE tables; raises KfvoError where all runs failed."""
     from kfvo_ros.evaluation.records import FAILED
     from kfvo_ros.evaluation.render import markdown
-    from kfvo_ros.evaluation.report import About, make_tables, write_report
-    pictures: tuple[Path, ...] = ()
-    if with_pictures:
-        from kfvo_ros.evaluation.report import draw
-        pictures = draw(plan.folder, runs, examiner)
-    about = About(plan.command, __version__, plan.reading.stop, plan.policy_name)
-    tables = make_tables(rows, about)
-    write_report(plan.folder, tables, pictures, about)
+    from kfvo_ros.evaluation.report import Provenance, make_tables, plot_runs, write_report
+    figures = plot_runs(plan.folder, runs, evaluator) if with_plots else ()
+    provenance = Provenance(plan.command, __version__, plan.sequence_options.stop,
+                            plan.policy_description)
+    tables = make_tables(rows, provenance)
+    write_report(plan.folder, tables, figures, provenance)
     failed = [row for row in rows if row.status == FAILED]
     if len(failed) == len(runs):
         raise KfvoError(f'all runs failed, the first because: {failed[0].problem}')
@@ -163,10 +169,10 @@ def _parse(argv: list[str]) -> argparse.Namespace:
     parser.add_argument('sequence', nargs='+', help='dataset folders or bags, or '
                         'synthetic:A-B[:smooth|fast|mixed|street]')
     parser.add_argument('--output', required=True, help='folder for results.csv, results.md, '
-                        'results.tex, results.html and the pictures; the files of each run come '
-                        'into its runs/SEQUENCE/METHOD/SEED')
+                        'results.tex, results.html and the plots; the files of each run are in '
+                        'its runs/SEQUENCE/METHOD/SEED')
     add_arguments(parser, BenchmarkOptions)
-    add_arguments(parser, OdometryOptions, ANSWERED)
+    add_arguments(parser, OdometryOptions, PLANNED)
     add_arguments(parser, VggtOptions)
     add_arguments(parser, SequenceOptions)
     arguments = parser.parse_args(argv)

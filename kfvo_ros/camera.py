@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Camera intrinsics and lens distortion, and the ROS calibration file that holds them."""
+"""Camera intrinsics and distortion, and their ROS calibration file."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from kfvo_ros.utils.files import read_yaml
 
 DISTORTION_SIZES = {'none': (0,), 'plumb_bob': (4, 5), 'rational_polynomial': (8,),
                     'equidistant': (4,)}
-"""Distortion models by their ROS name, and how many coefficients each may have."""
+"""Distortion models by ROS name, with their possible numbers of coefficients."""
 MODEL_SYNONYMS = {'': 'none', 'none': 'none', 'pinhole': 'none', 'plumb_bob': 'plumb_bob',
                   'radtan': 'plumb_bob', 'radial-tangential': 'plumb_bob',
                   'rational_polynomial': 'rational_polynomial', 'equidistant': 'equidistant',
                   'fisheye': 'equidistant'}
 NEWTON_STEPS = 15
-"""An ordinary lens takes three, the corners of a wide one eight."""
+"""Moderate distortion converges in three steps, the corners of a wide-angle image in eight."""
 CONVERGED = 1e-7
-"""Steps square: after one of this size the error is some 1e-14."""
+"""Convergence is quadratic: after a step of this size the error is about 1e-14."""
 MAX_VIEW_ANGLE = math.radians(80.0)
 """Rays farther off the axis have no usable pinhole coordinates."""
 MAX_READOUT = 0.2
-"""No shutter rolls longer than this [s]: what comes is probably in milliseconds."""
+"""Longest plausible readout time [s]; a larger number is probably in milliseconds."""
 
 
 @dataclass(frozen=True)
@@ -38,9 +38,9 @@ class Camera:
     """A calibrated camera: pinhole intrinsics [px] and a ROS distortion model.
 
     Pixel centres are at whole coordinates. ``distortion`` is in OpenCV's order (k1 k2 p1 p2 k3
-    ...; equidistant: k1 k2 k3 k4). ``guessed`` marks intrinsics nobody measured.
-    ``readout_s`` is the time from the first row of a rolling shutter to the last [s], zero for a
-    global shutter.
+    ...; equidistant: k1 k2 k3 k4). ``guessed`` marks intrinsics that were not measured.
+    ``readout_s`` is the time between the first and the last row of a rolling shutter [s], zero
+    for a global shutter.
     """
 
     width: int
@@ -63,15 +63,15 @@ class Camera:
         if model != 'equidistant' and not any(coefficients):
             model, coefficients = 'none', ()
         if model == 'plumb_bob' and len(coefficients) == 4:
-            coefficients += (0.0,)  # in ROS it always has a k3
+            coefficients += (0.0,)  # ROS always stores a k3
         if len(coefficients) not in DISTORTION_SIZES[model]:
             raise KfvoError(f'{model} takes {DISTORTION_SIZES[model]} distortion coefficients, '
                             f'{len(coefficients)} came')
         numbers = {'fx': self.fx, 'fy': self.fy, 'cx': self.cx, 'cy': self.cy} | {
             f'distortion[{index}]': value for index, value in enumerate(coefficients)}
-        odd = [f'{name}={value}' for name, value in numbers.items() if not math.isfinite(value)]
-        if odd:
-            raise KfvoError(f'expected finite numbers, came {" ".join(odd)}; is it calibrated?')
+        bad = [f'{name}={value}' for name, value in numbers.items() if not math.isfinite(value)]
+        if bad:
+            raise KfvoError(f'expected finite numbers, came {" ".join(bad)}; is it calibrated?')
         if min(self.width, self.height, self.fx, self.fy) <= 0:
             raise KfvoError(f'expected positive sizes and focal lengths, came {self.width}x'
                             f'{self.height} fx={self.fx} fy={self.fy}; is it calibrated?')
@@ -83,17 +83,17 @@ class Camera:
 
     @property
     def matrix(self) -> np.ndarray:
-        """K (3, 3)."""
+        """Intrinsic matrix K (3, 3)."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     @property
     def projection(self) -> np.ndarray:
-        """P (3, 4) of a camera that is one of its own, not the right one of a pair: [K 0]."""
+        """Projection matrix P (3, 4) of a monocular camera: [K 0]."""
         return np.column_stack([self.matrix, np.zeros(3)])
 
     @property
     def ros_distortion(self) -> tuple[str, tuple[float, ...]]:
-        """Model and coefficients in CameraInfo, which has no word for a lens without any."""
+        """Model and coefficients for CameraInfo, which has no name for zero distortion."""
         none = ('plumb_bob', (0.0,) * 5)
         return none if self.distortion_model == 'none' else (self.distortion_model,
                                                              self.distortion)
@@ -101,7 +101,7 @@ class Camera:
     def undistort(self, pixels: np.ndarray) -> np.ndarray:
         """Return undistorted normalised coordinates (N, 2) of pixels (N, 2).
 
-        Rays beyond MAX_VIEW_ANGLE, and pixels where the lens model has no inverse, are NaN.
+        Rays beyond MAX_VIEW_ANGLE, and pixels where the model has no inverse, are NaN.
         """
         pixels = np.asarray(pixels, dtype=np.float64).reshape(-1, 1, 2)
         if self.distortion_model == 'none' or len(pixels) == 0:
@@ -113,27 +113,27 @@ class Camera:
             points = self._undistort_polynomial(pixels[:, 0])
         usable = np.isfinite(points).all(axis=1)
         usable &= np.hypot(points[:, 0], points[:, 1]) < math.tan(MAX_VIEW_ANGLE)
-        back = self.distort(np.where(usable[:, None], points, 0.0))
-        usable &= np.linalg.norm(back - pixels[:, 0], axis=1) < 1e-3
+        reprojected = self.distort(np.where(usable[:, None], points, 0.0))
+        usable &= np.linalg.norm(reprojected - pixels[:, 0], axis=1) < 1e-3
         return np.where(usable[:, None], points, np.nan)
 
     def _undistort_polynomial(self, pixels: np.ndarray) -> np.ndarray:
         """Return normalised coordinates (N, 2) of pixels (N, 2) by Newton's method.
 
-        OpenCV's fixed-point iteration stops far from the answer, or goes astray, off the axis
-        of a wide lens. Past the turning point of the polynomial, where two rays meet in one
-        pixel, the answer is NaN.
+        OpenCV's fixed-point iteration stops early or diverges towards the edge of a wide-angle
+        image. Beyond the turning point of the polynomial, where two rays share one pixel, the
+        result is NaN.
         """
         points, zero = (pixels - (self.cx, self.cy)) / (self.fx, self.fy), np.zeros(3)
         with np.errstate(all='ignore'):
             for _ in range(NEWTON_STEPS):
                 rays = np.column_stack([points, np.ones(len(points))])
-                seen, jacobian = cv2.projectPoints(rays, zero, zero, self.matrix,
-                                                   np.array(self.distortion))
-                # At depth 1 the derivative by the camera's shift is that by the point.
+                projected, jacobian = cv2.projectPoints(rays, zero, zero, self.matrix,
+                                                        np.array(self.distortion))
+                # At depth 1 the derivative by the camera's translation is that by the point.
                 (a, b), (c, d) = np.moveaxis(jacobian.reshape(-1, 2, jacobian.shape[1]), 0,
                                              -1)[:, 3:5]
-                u, v = (pixels - seen[:, 0]).T
+                u, v = (pixels - projected[:, 0]).T
                 determinant = a * d - b * c
                 step = np.column_stack([d * u - b * v, a * v - c * u]) / determinant[:, None]
                 points = points + step
@@ -142,7 +142,7 @@ class Camera:
         return np.where(determinant[:, None] > 0.0, points, np.nan)
 
     def distort(self, points: np.ndarray) -> np.ndarray:
-        """Return the pixels (N, 2) where normalised coordinates (N, 2) are seen."""
+        """Return the pixels (N, 2) of undistorted normalised coordinates (N, 2)."""
         points = np.asarray(points, dtype=np.float64).reshape(-1, 2)
         if self.distortion_model == 'none' or len(points) == 0:
             return points * (self.fx, self.fy) + (self.cx, self.cy)
@@ -154,7 +154,7 @@ class Camera:
         return cv2.projectPoints(rays, zero, zero, self.matrix, coefficients)[0][:, 0]
 
     def scaled(self, width: int, height: int) -> Camera:
-        """Return the camera of the same image resized to width x height.
+        """Return the camera of the image resized to width x height.
 
         Raises KfvoError when the aspect ratio differs by more than a pixel: that is a crop.
         """
@@ -169,10 +169,10 @@ class Camera:
                        cy=(self.cy + 0.5) * factor - 0.5)
 
     def miscalibrated(self, focal: float, radial: float) -> Camera:
-        """Return what somebody might have measured instead, off by a share of the focal length.
+        """Return the camera with calibration errors, as training augments it.
 
-        By the other share, the first coefficient of the lens, it is off one focal length from
-        the axis.
+        `focal` is the relative error of fx and fy; `radial` is added to the first distortion
+        coefficient, so it is the relative radial error at one focal length from the axis.
         """
         model, coefficients = self.distortion_model, self.distortion
         if model == 'none':
@@ -186,24 +186,24 @@ class Camera:
         return replace(self, width=width, height=height, cx=self.cx - x, cy=self.cy - y)
 
     def binned(self, across: int, down: int) -> Camera:
-        """Return the camera whose pixels are blocks of `across` x `down` of this one's."""
+        """Return the camera of the image binned by `across` x `down` pixels."""
         return replace(self, width=self.width // across, height=self.height // down,
                        fx=self.fx / across, fy=self.fy / down,
                        cx=(self.cx + 0.5) / across - 0.5, cy=(self.cy + 0.5) / down - 0.5)
 
 
 def guess_camera(width: int, height: int) -> Camera:
-    """Return a plausible camera for an image of unknown origin: 60 degrees across the width."""
+    """Return a guessed camera of an uncalibrated image: a horizontal field of view of 60 deg."""
     focal = 0.5 * width / math.tan(math.radians(30.0))
     return Camera(width, height, focal, focal, 0.5 * (width - 1), 0.5 * (height - 1),
                   guessed=True)
 
 
 def read_camera_info(path: Path) -> Camera:
-    """Read a calibration in the form that ROS' camera_calibration writes.
+    """Read a calibration file in the format of ROS' camera_calibration.
 
-    An extra key ``readout_s`` says how long a rolling shutter takes from first to last row [s].
-    Raises KfvoError naming the file and the key that is missing or wrong.
+    The optional extra key ``readout_s`` is the readout time of a rolling shutter [s]. Raises
+    KfvoError naming the file and the key that is missing or wrong.
     """
     document = read_yaml(path, 'the calibration ')
     try:
@@ -221,7 +221,7 @@ def read_camera_info(path: Path) -> Camera:
 
 
 def write_camera_info(path: Path, camera: Camera) -> None:
-    """Write the calibration for `read_camera_info`; raises KfvoError naming the file."""
+    """Write a calibration file for `read_camera_info`; raises KfvoError naming the file."""
     model, coefficients = camera.ros_distortion
     matrices = {'camera_matrix': camera.matrix, 'rectification_matrix': np.eye(3),
                 'projection_matrix': camera.projection,

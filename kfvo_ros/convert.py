@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""``python -m kfvo_ros.convert SEQUENCE BAG``: any sequence to a recording of ROS 2."""
+"""``python -m kfvo_ros.convert SEQUENCE BAG``: write any sequence as a ROS 2 bag."""
 
 from __future__ import annotations
 
@@ -10,11 +10,16 @@ import shlex
 import sys
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.utils.commands import make_parser, run_command
-from kfvo_ros.utils.process import signals_collected
+from kfvo_ros.utils.signals import signals_collected
+
+if TYPE_CHECKING:
+    from kfvo_ros.sequences.bag.recorder import Recorder
+    from kfvo_ros.sequences.bag.writer import BagWriter
+    from kfvo_ros.sequences.base import Sequence
 
 EXAMPLES = """examples:
   python -m kfvo_ros.convert V1_01_easy bags/V1_01 --topic /cam0/image_raw
@@ -22,8 +27,8 @@ EXAMPLES = """examples:
   python -m kfvo_ros.convert rgbd_dataset_freiburg1_desk bags/fr1_desk --compressed
 
 The bag is a folder with an MCAP file and metadata.yaml. It holds the images of one camera, its
-CameraInfo unless that was guessed, ground truth and /tf_static where the sequence has them; what
-else a bag recorded, an IMU or other cameras, stays behind. Bag time is the stamp of the images.
+CameraInfo unless that was guessed, and ground truth and /tf_static where the sequence has them.
+Other topics of a source bag (IMU, other cameras) are not copied. Bag time is the image stamp.
 """
 
 
@@ -33,7 +38,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _convert(argv: list[str]) -> None:
-    # The heavy imports come after the arguments were checked: --help answers at once.
+    # Slow imports follow the checks of the arguments, so that --help and errors are immediate.
     arguments = _parse(argv)
     from kfvo_ros.odometry.options import SequenceOptions
     from kfvo_ros.sequences.bag.writer import BagWriter
@@ -58,8 +63,8 @@ def _convert(argv: list[str]) -> None:
 
 
 def _parse(argv: list[str]) -> argparse.Namespace:
+    from kfvo_ros.images import CODECS
     from kfvo_ros.odometry.options import SequenceOptions
-    from kfvo_ros.sequences.bag.messages import CODECS
     from kfvo_ros.utils.config import add_arguments
     parser = make_parser(
         'kfvo_convert', 'Write any sequence as a bag that "ros2 bag play" plays.', EXAMPLES)
@@ -69,8 +74,7 @@ def _parse(argv: list[str]) -> argparse.Namespace:
     parser.add_argument('--topic', help='topic of the images (default: that of the bag they come '
                         'from, else /camera/image_raw)')
     parser.add_argument('--compressed', nargs='?', const=CODECS[0], choices=CODECS,
-                        help='write CompressedImage; png, which loses nothing, unless jpeg is '
-                        'asked for')
+                        help='write CompressedImage: png, which is lossless (default), or jpeg')
     parser.add_argument('--zstd', action='store_true', help='compress the chunks of the file')
     parser.add_argument('--metadata-version', type=int, choices=(8, 9), default=9,
                         help='8 for ROS 2 before Jazzy (default: 9)')
@@ -78,8 +82,9 @@ def _parse(argv: list[str]) -> argparse.Namespace:
     return parser.parse_args(argv)
 
 
-def _record(sequence: Any, recorder: Any, stop: int | None, interrupts: list[int]) -> str | None:
-    """Write the frames; return why it ended before the end, if it did."""
+def _record(sequence: Sequence, recorder: Recorder, stop: int | None,
+            interrupts: list[int]) -> str | None:
+    """Write the frames; return the reason for an early end, else None."""
     from tqdm import tqdm
     total = sequence.length if stop is None else min(stop, sequence.length or stop)
     try:
@@ -92,15 +97,15 @@ def _record(sequence: Any, recorder: Any, stop: int | None, interrupts: list[int
     return None
 
 
-def _describe(writer: Any, recorder: Any, bag: str) -> str:
-    """Return the few lines a person wants to see at the end."""
+def _describe(writer: BagWriter, recorder: Recorder, bag: str) -> str:
+    """Return a summary of the bag for the terminal."""
     width = max(map(len, writer.topics))
-    lines = [f'{topic:{width}}  {written.messages} x {written.message_type.replace("/msg/", "/")}'
-             for topic, written in sorted(writer.topics.items())]
+    lines = [f'{topic:{width}}  {info.message_count} x {info.message_type.replace("/msg/", "/")}'
+             for topic, info in sorted(writer.topics.items())]
     if recorder.camera is None:
-        lines.append('no CameraInfo: nobody calibrated this camera; give --camera')
+        lines.append('no CameraInfo: this camera is not calibrated; give --camera')
     elif recorder.camera.readout_s > 0.0:
-        lines.append('camera_info.yaml in it has the rolling shutter, which CameraInfo cannot say')
+        lines.append('camera_info.yaml in it has the readout time, which CameraInfo cannot hold')
     size_mb = sum(path.stat().st_size for path in writer.path.iterdir()) / 1e6
     lines.append(f'{bag}: {recorder.frame_count} images, {size_mb:.1f} MB; replay it by')
     lines += [f'  {player} {shlex.quote(bag)}'

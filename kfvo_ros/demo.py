@@ -1,9 +1,9 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""``python -m kfvo_ros.demo``: the whole way from a rendered room to odometry in ROS 2.
+"""``python -m kfvo_ros.demo``: from a rendered room to evaluated odometry in ROS 2.
 
-A sequence becomes a bag; kfvo_node and the player run as two processes over DDS, as on a robot;
-the trajectory is compared with the truth.
+Converts a sequence to a bag, runs kfvo_node and the player as two processes over DDS, as on a
+robot, and compares the trajectory with the ground truth.
 """
 
 from __future__ import annotations
@@ -17,9 +17,10 @@ from typing import Any
 from kfvo_ros import __version__
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.utils.commands import make_parser, run_command
+from kfvo_ros.utils.signals import signals_blocked
 
 SEQUENCE = 'synthetic:8:smooth'
-BAG, TRAJECTORY, SUMMARY, PICTURE = 'bag', 'trajectory.tum', 'summary.json', 'trajectory.png'
+BAG, TRAJECTORY, SUMMARY, PLOT = 'bag', 'trajectory.tum', 'summary.json', 'trajectory.png'
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -30,61 +31,62 @@ def main(argv: list[str] | None = None) -> int:
 def _run(argv: list[str]) -> None:
     parser = make_parser('kfvo_demo', __doc__ or '')
     parser.add_argument('--output', default='demo', help='folder, emptied of earlier results')
-    parser.add_argument('--sequence', default=SEQUENCE, help='synthetic:SEED[:STYLE], or whatever '
-                        'kfvo_convert takes and has ground truth (default: %(default)s)')
+    parser.add_argument('--sequence', default=SEQUENCE, help='synthetic:SEED[:STYLE], or any '
+                        'input of kfvo_convert with ground truth (default: %(default)s)')
     arguments = parser.parse_args(argv)
     folder = Path(arguments.output)
-    print(_table(_demonstrate(arguments.sequence, folder), folder))
+    print(_format_table(_run_demo(arguments.sequence, folder), folder))
 
 
-def _demonstrate(text: str, folder: Path) -> dict[str, Any]:
+def _run_demo(text: str, folder: Path) -> dict[str, Any]:
     """Convert, play, listen and evaluate; return the summary."""
-    # The heavy imports come after the arguments were checked: --help answers at once.
+    # Heavy imports after the check of the arguments: --help answers at once.
+    with signals_blocked():
+        from kfvo_ros.ros.end_to_end import run_node
     from kfvo_ros import convert
-    from kfvo_ros.ros.end_to_end import run_node
     from kfvo_ros.sequences import open_sequence
     sequence = open_sequence(text)
     truth = sequence.ground_truth()
     if truth is None:
         raise KfvoError(f'{text} has no ground truth to compare with')
     shutil.rmtree(folder / BAG, ignore_errors=True)
-    for name in (TRAJECTORY, SUMMARY, PICTURE):
+    for name in (TRAJECTORY, SUMMARY, PLOT):
         (folder / name).unlink(missing_ok=True)
     print(f'1. {text} to {folder / BAG}', flush=True)
     if convert.main([text, str(folder / BAG)]) != 0:
         raise KfvoError('the sequence could not be converted')
     print('2. kfvo_node and kfvo_play, over DDS', flush=True)
-    heard = run_node(folder / BAG, sequence.topic, {
+    run = run_node(folder / BAG, sequence.topic, {
         'queue_size': 10, 'trajectory_file': str(folder / TRAJECTORY)})
     print('3. evaluation', flush=True)
-    return _evaluate(folder, text, truth.trajectory, heard)
+    return _evaluate(folder, text, truth.trajectory, run)
 
 
-def _evaluate(folder: Path, text: str, truth: Any, heard: Any) -> dict[str, Any]:
-    """Write summary and picture."""
+def _evaluate(folder: Path, text: str, truth: Any, run: Any) -> dict[str, Any]:
+    """Write summary and plot; return the summary."""
     import numpy as np
 
     from kfvo_ros.evaluation.plots import plot_trajectory
-    from kfvo_ros.odometry.results import evaluate
+    from kfvo_ros.evaluation.results import evaluate
     from kfvo_ros.sequences.base import GroundTruth
     from kfvo_ros.trajectory import read_tum
     estimate = read_tum(folder / TRAJECTORY)
     summary = {
-        'sequence': text, 'version': __version__, 'frames': heard.received,
-        'poses': len(heard.stamps_ns), 'dropped': heard.dropped,
-        'lost_in_transit': heard.missed, 'keyframes': len(heard.keyframes_ns),
-        'latency_ms': {'median': heard.latency_median_ms, 'p95': heard.latency_p95_ms},
+        'sequence': text, 'version': __version__, 'frames': run.received,
+        'poses': len(run.stamps_ns), 'dropped': run.dropped,
+        'lost_in_transit': run.lost_in_transit, 'keyframes': len(run.keyframes_ns),
+        'latency_ms': {'median': run.latency_median_ms, 'p95': run.latency_p95_ms},
         **evaluate(estimate, GroundTruth(truth))}
     (folder / SUMMARY).write_text(json.dumps(summary, indent=2) + '\n', encoding='utf-8')
     if 'ate_rmse_m' not in summary:
         raise KfvoError(f'no ATE: {summary["ground_truth_problem"]}')
-    plot_trajectory(folder / PICTURE, estimate, truth, np.array(heard.keyframes_ns),
+    plot_trajectory(folder / PLOT, estimate, truth, np.array(run.keyframes_ns),
                     f'kfvo_node on {text}')
     return summary
 
 
-def _table(summary: dict[str, Any], folder: Path) -> str:
-    """Return what a person wants to see."""
+def _format_table(summary: dict[str, Any], folder: Path) -> str:
+    """Return the summary as an aligned table, and the files."""
     latency = summary['latency_ms']
     share = 100.0 * summary['ate_rmse_m'] / summary['path_length_m']
     rows = [('frames received', summary['frames']), ('poses published', summary['poses']),
@@ -96,7 +98,7 @@ def _table(summary: dict[str, Any], folder: Path) -> str:
             ('latency', f'{latency["median"]:.1f} ms median, {latency["p95"]:.1f} ms at 95 %')]
     width = max(len(name) for name, _ in rows)
     return '\n'.join(['', *(f'  {name:{width}}  {value}' for name, value in rows), '',
-                      f'{folder / TRAJECTORY}, {folder / SUMMARY}, {folder / PICTURE}'])
+                      f'{folder / TRAJECTORY}, {folder / SUMMARY}, {folder / PLOT}'])
 
 
 if __name__ == '__main__':

@@ -3,8 +3,8 @@
 """Rotations, rigid transforms and similarities as plain float64 arrays.
 
 ``T_a_b`` (4, 4) maps points of frame b into frame a: ``x_a = T_a_b @ x_b``. Quaternions are
-``quat_xyzw``, unit norm, ``qw >= 0``. Every function accepts leading batch axes unless it says
-otherwise.
+``quat_xyzw``, unit norm, ``qw >= 0``. Functions accept leading batch axes unless their shapes
+say otherwise.
 """
 
 from __future__ import annotations
@@ -12,6 +12,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+
+from kfvo_ros.errors import KfvoError
 
 
 def make_transform(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
@@ -21,6 +23,25 @@ def make_transform(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
     transform[..., :3, :3] = rotation
     transform[..., :3, 3] = translation
     transform[..., 3, 3] = 1.0
+    return transform
+
+
+def as_rigid_transform(numbers: object, source: str) -> np.ndarray:
+    """Return T (4, 4) of 16 numbers in row-major order.
+
+    Raises KfvoError that begins with `source` when the numbers are no rigid transform.
+    """
+    try:
+        transform = np.array(numbers, dtype=np.float64).reshape(4, 4)
+    except (TypeError, ValueError):
+        transform = np.zeros((4, 4))
+    rotation = transform[:3, :3]
+    if not (np.isfinite(transform).all() and np.allclose(transform[3], (0, 0, 0, 1))
+            and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
+            and np.linalg.det(rotation) > 0):
+        found = ' '.join(str(numbers).split())
+        raise KfvoError(f'{source}: expected a rigid 4x4 transform (a rotation, a translation, '
+                        f'and 0 0 0 1 below), found {found[:200]}')
     return transform
 
 
@@ -50,10 +71,10 @@ def exp_so3(rotation_vector: np.ndarray) -> np.ndarray:
     vector = np.asarray(rotation_vector, dtype=np.float64)
     angle = np.linalg.norm(vector, axis=-1)[..., None, None]
     # np.sinc keeps both coefficients smooth through zero: sin(a)/a and (1 - cos(a))/a^2.
-    first = np.sinc(angle / np.pi)
-    second = 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2
+    linear = np.sinc(angle / np.pi)
+    quadratic = 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2
     generator = skew(vector)
-    return np.eye(3) + first * generator + second * (generator @ generator)
+    return np.eye(3) + linear * generator + quadratic * (generator @ generator)
 
 
 def log_so3(rotation: np.ndarray) -> np.ndarray:
@@ -70,7 +91,7 @@ def rotation_angle(rotation: np.ndarray) -> np.ndarray:
     r = np.asarray(rotation, dtype=np.float64)
     x, y, z = (r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0],
                r[..., 1, 0] - r[..., 0, 1])
-    # Twice the sine and the cosine: the one is exact where the other loses digits.
+    # Twice the sine and twice the cosine: each is precise where the other loses digits.
     return np.arctan2(np.sqrt(x * x + y * y + z * z),
                       r[..., 0, 0] + r[..., 1, 1] + r[..., 2, 2] - 1.0)
 
@@ -78,18 +99,18 @@ def rotation_angle(rotation: np.ndarray) -> np.ndarray:
 def quat_xyzw_from_rotation(rotation: np.ndarray) -> np.ndarray:
     """Return unit quaternions (..., 4), qw >= 0, of rotations (..., 3, 3).
 
-    The largest of the four candidates is taken, so no angle loses digits (Shepperd 1978).
+    The longest of four candidates is normalised, so no angle loses digits (Shepperd 1978).
     """
     r = np.asarray(rotation, dtype=np.float64)
-    candidates = (r.reshape(-1, 9) @ _SLOPES + _OFFSET).reshape(-1, 4, 4)
-    largest = candidates.diagonal(axis1=1, axis2=2).argmax(axis=1)
-    quaternion = candidates[np.arange(len(candidates)), largest]
-    length = np.sqrt((quaternion * quaternion).sum(axis=1, keepdims=True))
-    return (quaternion / np.copysign(length, quaternion[:, 3:])).reshape(*r.shape[:-2], 4)
+    candidates = (r.reshape(-1, 9) @ _CANDIDATE_SLOPES + _CANDIDATE_OFFSET).reshape(-1, 4, 4)
+    longest = candidates.diagonal(axis1=1, axis2=2).argmax(axis=1)
+    quaternion = candidates[np.arange(len(candidates)), longest]
+    norm = np.sqrt((quaternion * quaternion).sum(axis=1, keepdims=True))
+    return (quaternion / np.copysign(norm, quaternion[:, 3:])).reshape(*r.shape[:-2], 4)
 
 
-def _quaternions(r: np.ndarray) -> np.ndarray:
-    """Return four multiples (4, 4) of a rotation's quaternion, by x, y, z and w: 4 q q^T."""
+def _quaternion_candidates(r: np.ndarray) -> np.ndarray:
+    """Return 4 q q^T (4, 4) of a rotation (3, 3): its rows are q times x, y, z and w."""
     x, y, z = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
     xy, xz, yz = r[1, 0] + r[0, 1], r[2, 0] + r[0, 2], r[2, 1] + r[1, 2]
     (a, _, _), (_, b, _), (_, _, c) = r
@@ -97,13 +118,14 @@ def _quaternions(r: np.ndarray) -> np.ndarray:
                      [xz, yz, 1.0 - a - b + c, z], [x, y, z, 1.0 + a + b + c]])
 
 
-# They are linear in the rotation, so one product makes those of many.
-_OFFSET = _quaternions(np.zeros((3, 3))).ravel()
-_SLOPES = np.array([_quaternions(unit.reshape(3, 3)).ravel() - _OFFSET for unit in np.eye(9)])
+# The candidates are linear in the rotation, so one matrix product serves a whole batch.
+_CANDIDATE_OFFSET = _quaternion_candidates(np.zeros((3, 3))).ravel()
+_CANDIDATE_SLOPES = np.array([_quaternion_candidates(unit.reshape(3, 3)).ravel()
+                              - _CANDIDATE_OFFSET for unit in np.eye(9)])
 
 
 def rotation_from_quat_xyzw(quat_xyzw: np.ndarray) -> np.ndarray:
-    """Return rotations (..., 3, 3) of quaternions (..., 4); the norm is divided out."""
+    """Return rotations (..., 3, 3) of quaternions (..., 4), which need no unit norm."""
     quaternion = np.asarray(quat_xyzw, dtype=np.float64)
     quaternion = quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)
     vector, scalar = quaternion[..., :3], quaternion[..., 3, None, None]
@@ -112,18 +134,22 @@ def rotation_from_quat_xyzw(quat_xyzw: np.ndarray) -> np.ndarray:
 
 
 def transform_from_xyz_quat(values: np.ndarray) -> np.ndarray:
-    """Return T (..., 4, 4) of ``x y z qx qy qz qw`` (..., 7), as text and messages hold poses."""
+    """Return T (..., 4, 4) of ``x y z qx qy qz qw`` (..., 7), the order of files and messages."""
     return make_transform(rotation_from_quat_xyzw(values[..., 3:]), values[..., :3])
 
 
 def orthonormalise(transform: np.ndarray) -> np.ndarray:
-    """Return T (..., 4, 4) with an exact rotation; products of many drift away from one."""
+    """Return T (..., 4, 4) with its rotation made orthonormal.
+
+    Odometry feeds poses back through `invert`, which transposes the rotation. A departure from
+    orthonormality therefore grows two- to threefold per frame unless it is removed each time.
+    """
     quat_xyzw = quat_xyzw_from_rotation(transform[..., :3, :3])
     return make_transform(rotation_from_quat_xyzw(quat_xyzw), transform[..., :3, 3])
 
 
 def best_rotation(source: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Return the rotation (3, 3) that turns vectors `source` (N, 3) closest to `target` (N, 3).
+    """Return the rotation (3, 3) that maps vectors `source` (N, 3) closest to `target` (N, 3).
 
     Source: Kabsch, "A solution for the best rotation to relate two sets of vectors", 1976.
     """
@@ -131,7 +157,7 @@ def best_rotation(source: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
-    """Return the rotations (..., 3, 3) R of largest trace(R^T M) to matrices M (..., 3, 3)."""
+    """Return the rotations R (..., 3, 3) that maximise trace(R^T M) of matrices M (..., 3, 3)."""
     u, _, vt = np.linalg.svd(matrix)
     u[..., 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
     return u @ vt
@@ -158,7 +184,7 @@ class Similarity:
 def umeyama(source: np.ndarray, target: np.ndarray, with_scale: bool = True) -> Similarity:
     """Return the least-squares similarity from source to target points, both (N, 3), N >= 1.
 
-    Coincident source points determine a translation and nothing else. Source: Umeyama,
+    Coincident source points give a translation only: scale 1 and no rotation. Source: Umeyama,
     "Least-squares estimation of transformation parameters between two point patterns", PAMI
     1991.
     """

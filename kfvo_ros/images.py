@@ -1,8 +1,8 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Encoded pixels to arrays: ROS image buffers, compressed images and image files.
+"""Decoding of pixels: ROS image buffers, compressed images and image files.
 
-Every image is uint8, (H, W) grey or (H, W, 3) RGB. Of 16-bit samples the high byte is taken: a
+Every image is uint8, (H, W) grey or (H, W, 3) RGB. 16-bit samples keep their high byte: a
 constant rule, because stretching each image to its own range would make brightness flicker.
 """
 
@@ -17,12 +17,14 @@ import numpy as np
 
 from kfvo_ros.errors import KfvoError, reason_of
 
+CODECS = ('png', 'jpeg')
+"""Codecs of the compressed images that bags are written with; png is lossless."""
 Bytes = bytes | bytearray | memoryview | array | np.ndarray
-"""What ROS clients and bag readers hand out as uint8[]."""
+"""Types in which ROS clients and bag readers return uint8[]."""
 
 
 class PixelLayout(NamedTuple):
-    """How an encoding stores one pixel, and the OpenCV conversion to RGB, if it needs one."""
+    """How an encoding stores one pixel, and the OpenCV conversion to RGB where one is needed."""
 
     sample_bytes: int
     channels: int
@@ -36,14 +38,14 @@ LAYOUTS = {
     'mono16': PixelLayout(2, 1), '16uc1': PixelLayout(2, 1),
     'rgb8': PixelLayout(1, 3), 'rgb16': PixelLayout(2, 3),
     'bgr8': PixelLayout(1, 3, cv2.COLOR_BGR2RGB), 'bgr16': PixelLayout(2, 3, cv2.COLOR_BGR2RGB),
-    '8uc3': PixelLayout(1, 3, cv2.COLOR_BGR2RGB),  # a bare OpenCV matrix, by habit BGR
+    '8uc3': PixelLayout(1, 3, cv2.COLOR_BGR2RGB),  # a plain OpenCV matrix, BGR by convention
     'rgba8': PixelLayout(1, 4, cv2.COLOR_RGBA2RGB), 'bgra8': PixelLayout(1, 4, cv2.COLOR_BGRA2RGB),
     'yuv422': PixelLayout(1, 2, cv2.COLOR_YUV2RGB_UYVY),
     'yuv422_yuy2': PixelLayout(1, 2, cv2.COLOR_YUV2RGB_YUY2),
     **{f'{name}{8 * size}': PixelLayout(size, 1, code)
        for name, code in BAYER_CODES.items() for size in (1, 2)},
 }
-"""Encodings of sensor_msgs/Image that are understood, in lower case."""
+"""Supported encodings of sensor_msgs/Image, in lower case."""
 
 
 def decode_image(encoding: str, height: int, width: int, step: int, is_bigendian: bool,
@@ -51,7 +53,7 @@ def decode_image(encoding: str, height: int, width: int, step: int, is_bigendian
     """Return the pixels of a sensor_msgs/Image, given as its plain fields.
 
     The array owns its memory. Raises KfvoError for an encoding that is not in LAYOUTS and for
-    sizes that do not fit together.
+    inconsistent sizes.
     """
     encoding = encoding.strip()
     layout = LAYOUTS.get(encoding.lower())
@@ -78,7 +80,7 @@ def decode_compressed(data: Bytes, format: str = '') -> np.ndarray:
     """Return the pixels of a sensor_msgs/CompressedImage or of the bytes of an image file.
 
     `format` is the message's: image_transport writes ``rgb8; jpeg compressed bgr8`` and sends
-    Bayer mosaics as grey. Raises KfvoError when the bytes are no picture of 8 or 16 bits.
+    Bayer mosaics as grey. Raises KfvoError when the bytes are no 8 or 16-bit image.
     """
     buffer = np.frombuffer(data, dtype=np.uint8)
     try:
@@ -96,14 +98,14 @@ def decode_compressed(data: Bytes, format: str = '') -> np.ndarray:
         return pixels if code is None else cv2.cvtColor(pixels, code)
     if pixels.shape[2] == 4:
         return cv2.cvtColor(pixels, cv2.COLOR_BGRA2RGB)
-    # As image_transport reads it: a colour encoding without "compressed bgr" after it means RGB.
-    names_order = bool(separator) and encoding.startswith(('rgb', 'bgr'))
-    is_rgb = names_order and 'compressed bgr' not in transport
+    # image_transport's rule: a colour encoding without "compressed bgr" after it means RGB.
+    states_order = bool(separator) and encoding.startswith(('rgb', 'bgr'))
+    is_rgb = states_order and 'compressed bgr' not in transport
     return pixels if is_rgb else cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)
 
 
 def read_image(path: Path) -> np.ndarray:
-    """Return the pixels of an image file as they are stored (EXIF orientation is ignored).
+    """Return the pixels of an image file as stored; EXIF orientation is ignored.
 
     Raises KfvoError naming the file.
     """
@@ -116,5 +118,5 @@ def read_image(path: Path) -> np.ndarray:
 
 
 def to_grey(image: np.ndarray) -> np.ndarray:
-    """Return (H, W) uint8 of a grey or RGB image; a grey one is returned as it is."""
+    """Return (H, W) uint8 of a grey or RGB image; a grey image is returned without a copy."""
     return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)

@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""``kfvo_node``, also ``python -m kfvo_ros.node``: live visual odometry in ROS 2."""
+"""``kfvo_node``, also ``python -m kfvo_ros.node``: visual odometry as a ROS 2 node."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import sys
 import time
 
 from kfvo_ros.utils.commands import make_parser, run_command
-from kfvo_ros.utils.process import Interrupted, ignore_signals, signals_blocked
+from kfvo_ros.utils.signals import Interrupted, ignore_signals, signals_blocked
 
 EXAMPLES = """examples:
   kfvo_node --ros-args -r image:=/camera/image_raw
@@ -39,10 +39,9 @@ def _run(argv: list[str]) -> None:
 
 
 def _parse(argv: list[str]) -> None:
-    from kfvo_ros.odometry.options import OdometryOptions, VggtOptions
-    from kfvo_ros.ros.options import NodeOptions, describe
-    make_parser('kfvo_node', 'Visual odometry of one camera. All choices are ROS parameters:\n\n'
-                + describe(NodeOptions, OdometryOptions, VggtOptions), EXAMPLES).parse_args(argv)
+    from kfvo_ros.ros.options import describe, node_parameters
+    make_parser('kfvo_node', 'Visual odometry of one camera. All options are ROS parameters:\n\n'
+                + describe(node_parameters()), EXAMPLES).parse_args(argv)
 
 
 if __name__ == '__main__':

@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""``python -m kfvo_ros.play BAG``: a bag of ROS 2 or ROS 1 onto ROS topics."""
+"""``python -m kfvo_ros.play BAG``: publish a bag of ROS 2 or ROS 1 on ROS topics."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.utils.commands import make_parser, run_command
-from kfvo_ros.utils.process import Interrupted, ignore_signals, signals_blocked
+from kfvo_ros.utils.signals import Interrupted, ignore_signals, signals_blocked
 
 EXAMPLES = """examples:
   python -m kfvo_ros.play MH_01_easy.bag --wait-for-subscribers
@@ -20,19 +20,19 @@ EXAMPLES = """examples:
   python -m kfvo_ros.play demo/bag --topic /cam0/image_raw --rate 0.5
   python -m kfvo_ros.play MH_01_easy.bag --ros-args -r /cam0/image_raw:=/image
 """
-_log = logging.getLogger('kfvo_ros.play')  # not __main__, as which it is run
+_log = logging.getLogger('kfvo_ros.play')  # __name__ may be __main__
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command; return its exit status."""
-    # Unlike the other commands it also tells what it does, and no line needs a level.
+    # Unlike the other commands it logs at level INFO, without the level in each line.
     logging.basicConfig(format='kfvo_play: %(message)s', level=logging.WARNING)
     logging.getLogger('kfvo_ros').setLevel(logging.INFO)
     return run_command('kfvo_play', _run, argv, until_stopped=True)
 
 
 def _run(argv: list[str]) -> None:
-    # The heavy imports come after the arguments were checked: --help answers at once.
+    # Heavy imports after the check of the arguments: --help answers at once.
     with signals_blocked():
         from kfvo_ros.ros.options import PlayOptions
         from kfvo_ros.utils.config import from_arguments
@@ -49,10 +49,10 @@ def _run(argv: list[str]) -> None:
                 player.play()
                 ending = ''
             except Interrupted:
-                ending = f', interrupted at {player.seconds:.1f} s'
+                ending = f', interrupted at {player.position_s:.1f} s'
             finally:
                 ignore_signals()
-    print(f'{player.count} messages published{ending}')
+    print(f'{player.published} messages published{ending}')
 
 
 def _parse(argv: list[str]) -> argparse.Namespace:
@@ -68,7 +68,7 @@ def _parse(argv: list[str]) -> argparse.Namespace:
 
 
 def _choose_topics(bag: Any, wanted: tuple[str, ...]) -> list[str]:
-    """Return the topics to play: those wanted, or all but the image topics after the first."""
+    """Return the wanted topics, by default all but the image topics after the first."""
     if wanted:
         return [_find_topic(bag, topic) for topic in dict.fromkeys(wanted)]
     if not bag.topics:
@@ -81,6 +81,7 @@ def _choose_topics(bag: Any, wanted: tuple[str, ...]) -> list[str]:
 
 
 def _find_topic(bag: Any, topic: str) -> str:
+    """Return the name of a topic of the bag, with or without its leading slash."""
     name = f'/{topic.lstrip("/")}'
     if name not in bag.topics:
         raise KfvoError(f'{bag.path} has no messages on {topic}; its topics are: '

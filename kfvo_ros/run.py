@@ -13,7 +13,7 @@ from typing import Any
 from kfvo_ros import __version__
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.utils.commands import make_parser, run_command
-from kfvo_ros.utils.process import signals_collected
+from kfvo_ros.utils.signals import signals_collected
 
 EXAMPLES = """examples:
   python -m kfvo_ros.run synthetic:7 --output out
@@ -32,8 +32,8 @@ def _run(argv: list[str]) -> None:
     from kfvo_ros.odometry.options import OdometryOptions, SequenceOptions, VggtOptions
     from kfvo_ros.utils.config import from_arguments
     arguments = _parse(argv)
+    from kfvo_ros.evaluation.results import ResultWriter
     from kfvo_ros.odometry import factory
-    from kfvo_ros.odometry.results import ResultWriter
     from kfvo_ros.utils.process import single_threaded
     odometry_options = from_arguments(OdometryOptions, arguments)
     sequence_options = from_arguments(SequenceOptions, arguments)
@@ -47,7 +47,7 @@ def _run(argv: list[str]) -> None:
         about = {'sequence': sequence.name, 'backbone': odometry.backbone.name,
                  'keyframe_policy': odometry.policy.name, 'scale_rule': odometry.scale.rule,
                  'seed': odometry_options.seed, 'version': __version__,
-                 **odometry.backbone.condition()}
+                 **odometry.backbone.device_info()}
         with signals_collected():  # an impatient second Ctrl-C would cost the summary
             writer.append(odometry.finish())
             summary = writer.finish(about | ({'ended_early': problem} if problem else {}), truth)

@@ -1,9 +1,9 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Stamped poses, and the TUM and KITTI files that hold them.
+"""Stamped poses, and their TUM and KITTI files.
 
 A stamp is an int of nanoseconds. Decimal text becomes nanoseconds without a float in between,
-because a float64 of a present-day epoch is only good to 0.2 microseconds.
+because a float64 of a present-day epoch resolves only 0.2 microseconds.
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ from kfvo_ros.utils.files import parse_floats, parse_pose, read_rows
 
 NANOSECONDS = 1_000_000_000
 ASSOCIATION_LIMIT_NS = 10_000_000
-"""Ground truth farther than this from a frame is not its ground truth (10 ms)."""
+"""Largest time difference of a frame and its ground truth (10 ms)."""
 UNKNOWN_VARIANCE = 9999.0
-"""Variance of a velocity that nobody measured, as rtabmap has it; zero would mean exact."""
+"""Variance of an unmeasured velocity, rtabmap's value; zero would mean exact."""
 _DECIMAL = re.compile(r'([+-]?)([0-9]*)\.?([0-9]*)(?:[eE]([+-]?[0-9]{1,3}))?')
 
 
 def parse_stamp_ns(text: str) -> int:
-    """Return nanoseconds of decimal seconds, exact to the ninth decimal (further ones are cut).
+    """Return nanoseconds of decimal seconds, exact to the ninth decimal (the rest is truncated).
 
-    Exponents, as KITTI's times.txt prints them, are accepted. Raises ValueError, also for
-    what 64 bits of nanoseconds (292 years) cannot hold.
+    Exponents, which KITTI's times.txt uses, are accepted. Raises ValueError for other text and
+    for times beyond 64 bits of nanoseconds (292 years).
     """
-    found = _DECIMAL.fullmatch(text.strip())
-    if found is None or not found[2] + found[3]:
+    match = _DECIMAL.fullmatch(text.strip())
+    if match is None or not match[2] + match[3]:
         raise ValueError(f'not a decimal number of seconds: {text!r}')
-    sign, whole, fraction, exponent = found.groups()
+    sign, whole, fraction, exponent = match.groups()
     digits, shift = int(whole + fraction), 9 + int(exponent or 0) - len(fraction)
     value = digits * 10 ** shift if shift >= 0 else digits // 10 ** -shift
     if value >= 2 ** 63:
@@ -52,11 +52,11 @@ def format_stamp(stamp_ns: int) -> str:
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Poses along time.
+    """Stamped poses.
 
-    ``stamps_ns`` (N,) int64, strictly increasing for odometry, as read for ground truth;
+    ``stamps_ns`` (N,) int64, strictly increasing for odometry, in file order for ground truth;
     ``poses`` (N, 4, 4) float64, T_world_x; ``has_rotation`` is False for point measurements
-    (a prism, a GNSS antenna), whose rotations are identity and mean nothing.
+    (a prism, a GNSS antenna), whose rotations are identity and have no meaning.
     """
 
     stamps_ns: np.ndarray
@@ -80,7 +80,7 @@ class Trajectory:
         """Return the poses at `indices`."""
         return Trajectory(self.stamps_ns[indices], self.poses[indices], self.has_rotation)
 
-    def moved(self, T_x_y: np.ndarray) -> Trajectory:
+    def right_multiplied(self, T_x_y: np.ndarray) -> Trajectory:
         """Return the trajectory of y, rigidly mounted on x: T_world_y = T_world_x T_x_y."""
         return Trajectory(self.stamps_ns, self.poses @ T_x_y, self.has_rotation)
 
@@ -90,7 +90,7 @@ def associate(stamps_ns: np.ndarray, reference_ns: np.ndarray,
     """Match stamps to their nearest reference, one to one and within `limit_ns`.
 
     Returns index arrays into `stamps_ns` and `reference_ns`, in the order of `stamps_ns`. Of
-    two stamps that want the same reference the nearer one gets it.
+    two stamps with the same nearest reference, the nearer stamp is matched.
     """
     stamps_ns, reference_ns = np.asarray(stamps_ns), np.asarray(reference_ns)
     if len(stamps_ns) == 0 or len(reference_ns) == 0:
@@ -106,12 +106,12 @@ def associate(stamps_ns: np.ndarray, reference_ns: np.ndarray,
     candidates = np.flatnonzero(distance <= limit_ns)
     candidates = candidates[np.lexsort((candidates, distance[candidates]))]
     _, first = np.unique(nearest[candidates], return_index=True)
-    chosen = np.sort(candidates[first])
-    return chosen, order[nearest[chosen]]
+    matched = np.sort(candidates[first])
+    return matched, order[nearest[matched]]
 
 
 def format_tum_line(stamp_ns: int, T_world_x: np.ndarray) -> str:
-    """Return ``stamp tx ty tz qx qy qz qw`` and a newline."""
+    """Return a line of a TUM file, ``stamp tx ty tz qx qy qz qw``, with its newline."""
     quat_xyzw = geometry.quat_xyzw_from_rotation(T_world_x[:3, :3])
     numbers = ' '.join(f'{value:.9f}' for value in (*T_world_x[:3, 3], *quat_xyzw))
     return f'{format_stamp(stamp_ns)} {numbers}\n'
@@ -131,7 +131,7 @@ def read_tum(path: Path) -> Trajectory:
 def read_kitti_poses(path: Path, stamps_ns: np.ndarray) -> Trajectory:
     """Read a KITTI pose file (12 numbers per frame, the rows of T_world_camera 3x4).
 
-    The few digits of the file leave rotations that are none by 1e-7; they are made exact.
+    The few digits of the file leave errors of 1e-7 in the rotations, which are renormalised.
     Raises KfvoError when a line is not 12 numbers with a rotation in them, or the file is not
     one pose per stamp.
     """
@@ -140,9 +140,9 @@ def read_kitti_poses(path: Path, stamps_ns: np.ndarray) -> Trajectory:
         raise KfvoError(f'{path} holds {len(rows)} poses for {len(stamps_ns)} frames; '
                         'expected one line per frame')
     matrices = np.array(rows, dtype=np.float64).reshape(-1, 3, 4)
-    given = geometry.make_transform(matrices[:, :, :3], matrices[:, :, 3])
-    poses = geometry.orthonormalise(given)
-    wrong = np.flatnonzero(np.abs(poses - given).max(axis=(1, 2)) > 1e-2)
+    stored = geometry.make_transform(matrices[:, :, :3], matrices[:, :, 3])
+    poses = geometry.orthonormalise(stored)
+    wrong = np.flatnonzero(np.abs(poses - stored).max(axis=(1, 2)) > 1e-2)
     if len(wrong):
         raise KfvoError(f'{path}, pose {wrong[0]} (from 0): expected a rotation in the first '
                         'three columns, found another matrix; are these poses?')

@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Bags of either ROS, written on the spot for the readers' tests."""
+"""ROS 1 and ROS 2 bags, written for the tests of the readers."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ from kfvo_ros.sequences.bag.sequence import BagSequence
 
 STORAGES = ('ros1', 'sqlite3', 'mcap')
 
-START_NS = 1403715273262142977  # odd on purpose: no float64 holds it
+START_NS = 1403715273262142977  # no float64 holds this number
 COUNT = 5
 STAMPS_NS = [START_NS + 50_000_000 * index for index in range(COUNT)]
-LATER_NS = 3_000_000  # bag time is when it was recorded, not when it happened
+LATER_NS = 3_000_000  # recording delay: bag time is later than the stamp
 POSES = make_poses(COUNT)
-EASY = Camera(WIDTH, HEIGHT, 99.0, 99.0, 16.0, 12.0)
+PINHOLE = Camera(WIDTH, HEIGHT, 99.0, 99.0, 16.0, 12.0)
 
 Records = list[tuple[str, int, Any]]
 
 
-class BagWriter:
-    """Builds messages of either ROS and writes them as a bag of one of STORAGES."""
+class BagBuilder:
+    """Builds ROS 1 or ROS 2 messages and writes them as a bag of one of STORAGES."""
 
     def __init__(self, storage: str) -> None:
         self.storage = storage
         self.is_ros1 = storage == 'ros1'
-        self.silent: dict[str, str] = {}  # topic -> type, announced but never sent
-        self.offers: dict[str, dict[str, Any]] = {}  # topic -> how add_connection is told its QoS
+        self.empty_topics: dict[str, str] = {}  # topic -> type, without messages
+        self.offers: dict[str, dict[str, Any]] = {}  # topic -> QoS arguments of add_connection
         self.store = get_typestore(Stores.ROS1_NOETIC if self.is_ros1 else Stores.ROS2_JAZZY)
         if self.is_ros1:
             for name in ('tf2_msgs/msg/TFMessage', 'tf/msg/tfMessage'):
@@ -132,7 +132,7 @@ class BagWriter:
         return self.make(kind, transforms=list(transforms))
 
     def write(self, path: Path, records: Iterable[tuple[str, int, Any]]) -> Path:
-        """Write (topic, bag time [ns], message) under path and return what a user would give."""
+        """Write records (topic, bag time [ns], message) and return the path of the bag."""
         if self.is_ros1:
             path = path.with_name(f'{path.name}.bag')
             writer = rosbag1.Writer(path)
@@ -141,7 +141,7 @@ class BagWriter:
             writer = rosbag2.Writer(path, version=9, storage_plugin=plugin)
         with writer:
             connections: dict[str, Any] = {}
-            for topic, kind in self.silent.items():
+            for topic, kind in self.empty_topics.items():
                 writer.add_connection(topic, kind, typestore=self.store)
             for topic, bag_time_ns, message in records:
                 kind = message.__msgtype__
@@ -153,19 +153,19 @@ class BagWriter:
         return path
 
 
-def images(writer: BagWriter, topic: str = '/cam0/image_raw', frame_id: str = 'camera',
+def images(writer: BagBuilder, topic: str = '/cam0/image_raw', frame_id: str = 'camera',
            colour: bool = False) -> Records:
     """Return one image message per stamp."""
     return [(topic, stamp + LATER_NS, writer.image(stamp, make_image(index, colour), frame_id))
             for index, stamp in enumerate(STAMPS_NS)]
 
 
-def truth_records(writer: BagWriter, topic: str, make: Any, poses: np.ndarray = POSES) -> Records:
-    """Return one message per stamp, made by `make` of a stamp and a pose."""
+def truth_records(writer: BagBuilder, topic: str, make: Any, poses: np.ndarray = POSES) -> Records:
+    """Return one message per stamp, from `make(stamp_ns, pose)`."""
     return [(topic, stamp + LATER_NS, make(stamp, pose)) for stamp, pose in zip(STAMPS_NS, poses)]
 
 
-def open_bag(writer: BagWriter, folder: Path, *records: Records, **options: Any) -> BagSequence:
-    """Write a bag of the records and open it, with an easy camera unless another is given."""
+def open_bag(writer: BagBuilder, folder: Path, *records: Records, **options: Any) -> BagSequence:
+    """Write a bag of the records and open it, with a pinhole camera by default."""
     path = writer.write(folder / 'walk', [record for part in records for record in part])
-    return open_sequence(str(path), **{'camera': EASY, **options})
+    return open_sequence(str(path), **{'camera': PINHOLE, **options})

@@ -11,18 +11,20 @@ from pathlib import Path
 
 import pytest
 
-from kfvo_ros.utils.process import SIGNALS, single_threaded
+from kfvo_ros.utils.process import single_threaded
+from kfvo_ros.utils.signals import SIGNALS
 
-OVER_DDS = ('test_demo', 'test_node', 'test_play', 'test_vggt_node')
-"""Files whose processes talk to each other, and are timed: one after the other."""
+OVER_DDS = ('test_demo', 'test_vggt_node')
+"""Test files, besides those of test/ros, that communicate over DDS and are timed: run in turn."""
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Tell pytest-xdist what stays together: the tests of a file, and all that talk over DDS."""
     for item in items:
-        name = item.path.stem
-        item.add_marker(pytest.mark.xdist_group('dds' if name.startswith(OVER_DDS) else name))
+        name, folder = item.path.stem, item.path.parent.name
+        item.add_marker(pytest.mark.xdist_group(
+            'dds' if folder == 'ros' or name in OVER_DDS else name))
 
 
 @pytest.fixture(scope='session', autouse=True)
@@ -65,5 +67,5 @@ def data_path() -> Callable[[str], Path]:
 @pytest.fixture(scope='session')
 def small_vggt(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a file of weights of a small VGGT model, or a skip."""
-    from vggt_models import saved_small
-    return saved_small(tmp_path_factory.mktemp('vggt') / 'small.safetensors')
+    from vggt_models import save_small_model
+    return save_small_model(tmp_path_factory.mktemp('vggt') / 'small.safetensors')

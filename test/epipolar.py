@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Tracks against a true motion."""
+"""Epipolar errors of tracks for a known motion."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A camera that publishes, a kfvo_node in a process of its own, and all that it says."""
+"""Test rig: a simulated camera, a kfvo_node in another process, and a listener to its topics."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ BEST_EFFORT = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 @cache
 def make_frames() -> tuple[Frame, ...]:
-    """Render a smooth walk, once; the policy that comes along drops some of its frames."""
+    """Render a smooth walk, once; the bundled policy makes some of its frames no keyframe."""
     return tuple(SyntheticSequence(2, 'smooth', COUNT, WIDTH, HEIGHT))
 
 
@@ -62,7 +62,7 @@ def stamped(message: Any, stamp: int, frame_id: str = 'lens') -> Any:
 
 def to_image(stamp: int, pixels: np.ndarray, encoding: str = 'mono8', step: int = 0,
              **fields: Any) -> Any:
-    """Return a sensor_msgs/Image of rows of bytes (H, row); `fields` replace what is said."""
+    """Return a sensor_msgs/Image of rows of bytes (H, row); `fields` override its fields."""
     height, row = pixels.shape[:2]
     values = {'encoding': encoding, 'height': height, 'width': row, 'step': step or row,
               'data': array('B', np.ascontiguousarray(pixels).tobytes())} | fields
@@ -83,26 +83,27 @@ def to_pose(pose: Any) -> np.ndarray:
 
 
 def is_origin(message: Any) -> bool:
-    """Return whether an Odometry is where odom is."""
+    """Return whether an Odometry is the identity."""
     return bool(np.allclose(to_pose(message.pose.pose), np.eye(4), atol=1e-12))
 
 
 class Rig:
-    """Runs a node between with and its end; `image` and `info` publish what a camera does.
+    """Runs a node with `parameters` inside ``with``; `image` and `info` publish as a camera does.
 
-    `parameters` are the node's, which is ready within `patience` [s]. With `late` the camera
-    begins at `start_camera`. ``lines`` are what the node logs. One at a time: two would hear each
-    other.
+    The node must be ready within `timeout_s`. With `late_camera` the camera is advertised by
+    `start_camera`. `env` is the node's environment. ``lines`` are the node's log. Use one at a
+    time: two would receive each other's messages.
     """
 
     def __init__(self, image_type: Any = None, topic: str = IMAGE, qos: QoSProfile = RELIABLE,
-                 late: bool = False, patience: float = 20.0, **parameters: Any) -> None:
+                 late_camera: bool = False, timeout_s: float = 20.0,
+                 env: dict[str, str] | None = None, **parameters: Any) -> None:
         self.listener = Listener({
             ODOMETRY: nav_msgs.Odometry, PATH: nav_msgs.Path, KEYFRAME: geometry_msgs.PoseStamped,
             DIAGNOSTICS: diagnostic_msgs.DiagnosticArray})
         self.lines: list[str] = []
         self._image_type, self._topic, self._qos = image_type or sensor_msgs.Image, topic, qos
-        self._late, self._patience = late, patience
+        self._late_camera, self._timeout_s, self._env = late_camera, timeout_s, env
         parameters = {'process_every_frame': True} | parameters
         self._arguments = ['--ros-args', '-r', f'image:={topic}']
         for name, value in parameters.items():
@@ -112,14 +113,15 @@ class Rig:
 
     def __enter__(self) -> Rig:
         self._stack.enter_context(self.listener)
-        if not self._late:
+        if not self._late_camera:
             self.start_camera()
-        self.process = self._stack.enter_context(running_module(NODE, *self._arguments))
+        self.process = self._stack.enter_context(
+            running_module(NODE, *self._arguments, env=self._env))
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
-        self.wait_for_line('ready', self._patience)
+        self.wait_for_line('ready', self._timeout_s)
         wait_until(lambda: self.listener.node.count_publishers(ODOMETRY))
-        if not self._late:
+        if not self._late_camera:
             self.wait_for_subscriber()
         return self
 
@@ -141,7 +143,7 @@ class Rig:
         self.listener.node.destroy_publisher(self.info)
 
     def wait_for_subscriber(self) -> None:
-        """Wait until the node listens to the images, and to the calibration where it does."""
+        """Wait until the node subscribes to the images, and to the calibration if it needs one."""
         wait_until(self.image.get_subscription_count)
         if not any('camera_info_file' in argument for argument in self._arguments):
             wait_until(self.info.get_subscription_count)
@@ -153,10 +155,10 @@ class Rig:
                 self.info.publish(to_info(frame.camera, frame.stamp_ns))
             self.image.publish(to_image(frame.stamp_ns, frame.image))
 
-    def send_until_heard(self, frames: Sequence[Frame]) -> None:
-        """Send frames over and over, each later than the one before, until a pose comes.
+    def send_until_odometry(self, frames: Sequence[Frame]) -> None:
+        """Send frames repeatedly with increasing stamps until a pose arrives.
 
-        The node may know the camera later than the camera knows the node.
+        The node may discover the camera later than the camera discovers the node.
         """
         for index in range(100):
             frame = frames[index % len(frames)]
@@ -165,14 +167,14 @@ class Rig:
                 return
             time.sleep(0.05)
 
-    def drive(self, frames: Sequence[Frame]) -> list[Any]:
+    def run(self, frames: Sequence[Frame]) -> list[Any]:
         """Send frames and return their Odometry messages."""
         before = len(self.odometry())
         self.send(frames)
         return self.odometry(before + len(frames))[before:]
 
     def odometry(self, count: int = 0) -> list[Any]:
-        """Return all Odometry messages, once there are so many."""
+        """Return all Odometry messages once there are at least `count`."""
         wait_until(lambda: len(self.listener.messages(ODOMETRY)) >= count)
         return self.listener.messages(ODOMETRY)
 
@@ -184,12 +186,12 @@ class Rig:
                 {pair.key: pair.value for pair in status.values})
 
     def wait_for_value(self, key: str, value: object) -> None:
-        """Wait until diagnostics say so."""
+        """Wait until the diagnostics show this value."""
         wait_until(lambda: self.state()[2][key] == str(value))
 
-    def wait_for_line(self, part: str, patience: float = 20.0) -> str:
+    def wait_for_line(self, part: str, timeout_s: float = 20.0) -> str:
         """Wait until the node logs a line with this part; return the line."""
-        wait_until(lambda: any(part in line for line in self.lines), patience)
+        wait_until(lambda: any(part in line for line in self.lines), timeout_s)
         return next(line for line in self.lines if part in line)
 
     def call(self, service: Any, name: str, **request: Any) -> Any:
@@ -201,12 +203,12 @@ class Rig:
         return future.result()
 
     def reset(self) -> None:
-        """Begin anew, with nothing heard."""
+        """Reset the node and forget all received messages."""
         assert self.call(std_srvs.Trigger, 'reset').success
-        self.listener.heard.clear()
+        self.listener.received.clear()
 
     def stop(self, sent: signal.Signals = signal.SIGINT) -> float:
-        """End the node; return how long that took [s]."""
+        """Stop the node; return how long that took [s]."""
         began = time.monotonic()
         if self.process.poll() is None:
             self.process.send_signal(sent)

@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Scenes for the odometry's tests: projected point clouds and small rendered sequences."""
+"""Test scenes for odometry: projected point clouds and small rendered sequences."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from kfvo_ros.backbones.geometric.observations import FrameTracks
 from kfvo_ros.camera import Camera
 from kfvo_ros.keyframes.base import DecisionInput, KeyframePolicy
 from kfvo_ros.keyframes.heuristics import Survival
-from kfvo_ros.odometry.keyframe_odometry import FramePose, KeyframeOdometry, Update
+from kfvo_ros.odometry.keyframe_odometry import KeyframeOdometry
+from kfvo_ros.odometry.updates import FramePose, Update
 from kfvo_ros.sequences.base import Frame
 from kfvo_ros.sequences.synthetic.sequence import SyntheticSequence
 from kfvo_ros.tracking.tracker import Tracks
@@ -26,16 +27,16 @@ from kfvo_ros.trajectory import Trajectory
 CAMERA = Camera(640, 480, 400.0, 400.0, 319.5, 239.5)
 RATE_NS = 50_000_000
 PATTERN = [True, False, False, True, False]
-"""Which frames a Scripted policy keeps, again and again."""
+"""Decisions of a Scripted policy, to be repeated."""
 
 
-def sure(ids: np.ndarray, pixels: np.ndarray) -> Tracks:
-    """Return tracks that nobody doubts."""
+def certain_tracks(ids: np.ndarray, pixels: np.ndarray) -> Tracks:
+    """Return tracks without uncertainty."""
     return Tracks(ids, pixels, np.zeros(len(ids)))
 
 
 class PointCloud:
-    """Random points in front of the first camera, seen with `noise` [px]."""
+    """Random points in front of the first camera, observed with `noise` [px]."""
 
     def __init__(self, seed: int, count: int = 300, noise: float = 0.0) -> None:
         self._rng = np.random.default_rng(seed)
@@ -45,7 +46,7 @@ class PointCloud:
         self.noise = noise
 
     def pixels(self, T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return where all points (N, 2) are seen, and a mask of those that are."""
+        """Return pixels (N, 2) of all points, and a mask of the visible ones."""
         T_camera_world = geometry.invert(T_world_camera)
         points = self.points @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]
         pixels = points[:, :2] / points[:, 2:] * CAMERA.fx + (CAMERA.cx, CAMERA.cy)
@@ -53,25 +54,25 @@ class PointCloud:
         return pixels, inside & (points[:, 2] > 0.1)
 
     def encode(self, index: int, T_world_camera: np.ndarray) -> Encoded:
-        """Return what the geometric backbone's `encode` would: exact tracks, then noise."""
+        """Return a frame as encoded by the geometric backbone: exact tracks plus noise."""
         pixels, visible = self.pixels(T_world_camera)
         pixels = pixels + self.noise * self._rng.normal(size=pixels.shape)
-        tracks = sure(np.flatnonzero(visible), pixels[visible])
-        view = FrameTracks(index, tracks, CAMERA.undistort(tracks.pixels))
+        tracks = certain_tracks(np.flatnonzero(visible), pixels[visible])
+        frame_tracks = FrameTracks(index, tracks, CAMERA.undistort(tracks.pixels))
         descriptor = np.full(48, index, dtype=np.float32)
-        return Encoded(index * RATE_NS, descriptor, view, tracks)
+        return Encoded(index * RATE_NS, descriptor, frame_tracks, tracks)
 
 
 def window(poses: np.ndarray, seed: int = 0, noise: float = 0.0,
            backbone: GeometricBackbone | None = None) -> Window:
-    """Return the window of a new stream that knows nothing of earlier ones."""
+    """Return the first window of a new stream."""
     cloud = PointCloud(seed, noise=noise)
     frames = tuple(cloud.encode(index, pose) for index, pose in enumerate(poses))
     return Window((backbone or GeometricBackbone()).open(CAMERA), frames)
 
 
 def moving_poses(count: int, step: float = 0.15) -> np.ndarray:
-    """Return poses (N, 4, 4) of a camera that goes right and forward and turns a little."""
+    """Return poses (N, 4, 4) of a camera that moves right and forward and turns slightly."""
     along = np.arange(count)[:, None]
     return geometry.make_transform(
         geometry.exp_so3(along * [0.004, 0.012, -0.006]),
@@ -87,62 +88,62 @@ def turning_poses(count: int) -> np.ndarray:
 @lru_cache(maxsize=8)
 def frames_of(seed: int, count: int = 60, style: str = 'smooth', width: int = 320,
               height: int = 240) -> tuple[Frame, ...]:
-    """Return rendered frames; the same objects at every call."""
+    """Return rendered frames, the same objects at every call."""
     return tuple(SyntheticSequence(seed, style, count, width, height))
 
 
 def truth_of(seed: int, count: int = 60, style: str = 'smooth') -> Trajectory:
-    """Return the poses behind `frames_of`."""
+    """Return the ground truth of `frames_of`."""
     return SyntheticSequence(seed, style, count).ground_truth().trajectory
 
 
 def restamped(images: Iterable[np.ndarray], camera: Camera) -> list[Frame]:
-    """Return frames of images in a new order."""
+    """Return frames of the images with regular stamps."""
     return [Frame(RATE_NS * (1 + index), image, camera) for index, image in enumerate(images)]
 
 
 @dataclass
 class Run:
-    """All that came out of an odometry."""
+    """Output of an odometry: updates, final poses, and their copies at the time of emission."""
 
     updates: list[Update]
-    placed: list[FramePose]
-    handed_out: list[np.ndarray]
+    final: list[FramePose]
+    emitted_poses: list[np.ndarray]
 
     @property
     def poses(self) -> np.ndarray:
         """Final poses (N, 4, 4) in input order."""
-        return np.stack([placed.T_world_camera for placed in self.placed])
+        return np.stack([frame.T_world_camera for frame in self.final])
 
     @property
     def trajectory(self) -> Trajectory:
         """Final poses with their stamps."""
-        return Trajectory(np.array([placed.stamp_ns for placed in self.placed]), self.poses)
+        return Trajectory(np.array([frame.stamp_ns for frame in self.final]), self.poses)
 
     @property
     def statuses(self) -> list[str]:
-        """What was said of each frame."""
+        """Status of each frame."""
         return [update.status.value for update in self.updates]
 
 
 def run(frames: Iterable[Frame], policy: KeyframePolicy | None = None,
         backbone: Backbone | None = None, **options) -> Run:
-    """Feed frames to a new odometry; `handed_out` are the poses at the moment of finality."""
+    """Process frames with a new odometry."""
     odometry = KeyframeOdometry(backbone or GeometricBackbone(), policy or Survival(), **options)
     result = Run([], [], [])
     for frame in frames:
         update = odometry.process(frame)
         result.updates.append(update)
-        result.placed.extend(update.final)
-        result.handed_out.extend(placed.T_world_camera.copy() for placed in update.final)
+        result.final.extend(update.final)
+        result.emitted_poses.extend(pose.T_world_camera.copy() for pose in update.final)
     last = odometry.finish()
-    result.placed.extend(last)
-    result.handed_out.extend(placed.T_world_camera.copy() for placed in last)
+    result.final.extend(last)
+    result.emitted_poses.extend(pose.T_world_camera.copy() for pose in last)
     return result
 
 
 class Scripted(KeyframePolicy):
-    """Keeps or drops as a list says, then as its last entry does."""
+    """Returns the decisions of a list; the last one repeats."""
 
     name = 'scripted'
 
@@ -151,11 +152,11 @@ class Scripted(KeyframePolicy):
         self.seen: list[DecisionInput] = []
 
     def decide(self, decision: DecisionInput) -> bool:
-        """Follow the list."""
+        """Return the next decision."""
         self.seen.append(decision)
         return self._keeps.pop(0) if len(self._keeps) > 1 else self._keeps[0]
 
 
 def with_image(frame: Frame, image: np.ndarray) -> Frame:
-    """Return the frame showing something else."""
+    """Return the frame with another image."""
     return replace(frame, image=image)

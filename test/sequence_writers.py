@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Tiny datasets of every kind, written on the spot for the readers' tests."""
+"""Tiny datasets of every kind, written for the tests of the readers."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from kfvo_ros import geometry
 
 WIDTH, HEIGHT = 32, 24
 LENGTH = 4
-"""Frames of what `write_dataset` writes."""
+"""Number of frames of `write_dataset`."""
 
 
 def make_image(index: int, colour: bool = False) -> np.ndarray:
-    """Return noise (H, W) or (H, W, 3) RGB uint8: every index another."""
+    """Return noise (H, W) or (H, W, 3) RGB uint8, seeded by the index."""
     shape = (HEIGHT, WIDTH, 3) if colour else (HEIGHT, WIDTH)
     return np.random.default_rng(index).integers(0, 256, shape, dtype=np.uint8)
 
@@ -31,7 +31,7 @@ def make_poses(count: int, seed: int = 0) -> np.ndarray:
 
 
 def write_image(path: Path, image: np.ndarray) -> None:
-    """Write a lossless image file, grey or from RGB."""
+    """Write a lossless image file of a grey or RGB image."""
     path.parent.mkdir(parents=True, exist_ok=True)
     cv2.imwrite(str(path), image if image.ndim == 2 else image[..., ::-1])
 
@@ -43,7 +43,7 @@ def write_text(path: Path, *lines: str) -> None:
 
 
 def numbers(values: Iterable[float]) -> str:
-    """Return numbers in the shortest form that reads back exactly."""
+    """Return numbers in the shortest text that reads back exactly."""
     return ' '.join(repr(float(value)) for value in values)
 
 
@@ -54,7 +54,7 @@ def pose_numbers(pose: np.ndarray) -> list[float]:
 
 def write_camera_info(folder: Path, fx: float, width: int = WIDTH, height: int = HEIGHT,
                       cx: float = 16, cy: float = 12) -> None:
-    """Write a camera_info.yaml whose focal length tells it apart."""
+    """Write a camera_info.yaml; tests identify it by its focal length."""
     write_text(folder / 'camera_info.yaml', f'image_width: {width}', f'image_height: {height}',
                f'camera_matrix: {{data: [{fx}, 0, {cx}, 0, {fx}, {cy}, 0, 0, 1]}}',
                'distortion_model: plumb_bob', 'distortion_coefficients: {data: [0, 0, 0, 0, 0]}')
@@ -64,11 +64,11 @@ T_BODY_CAMERA = geometry.make_transform(geometry.exp_so3(np.array([0.1, -0.2, 1.
                                         np.array([-0.02, -0.06, 0.01]))
 
 # The writers below take images and T_world_camera, one of each per frame, and return the path
-# that a user would give and the stamps [ns] in it.
+# of the sequence and its stamps [ns].
 
 
 def write_euroc(root: Path, images: list[np.ndarray], poses: np.ndarray) -> tuple[Path, list[int]]:
-    """Write mav0 with 10 seconds of nanoseconds that no float64 holds."""
+    """Write mav0 with stamps that no float64 holds."""
     stamps_ns = [1403715273262142976 + 50_000_001 * index for index in range(len(images))]
     folder, cam0 = root / 'V1_01', root / 'V1_01' / 'mav0' / 'cam0'
     for stamp_ns, image in zip(stamps_ns, images):
@@ -90,7 +90,7 @@ def write_euroc(root: Path, images: list[np.ndarray], poses: np.ndarray) -> tupl
 
 
 def write_tum(root: Path, images: list[np.ndarray], poses: np.ndarray) -> tuple[Path, list[int]]:
-    """Write a freiburg1 folder with microseconds, and ground truth of its own stamps."""
+    """Write a freiburg1 folder with stamps in microseconds."""
     folder = root / 'rgbd_dataset_freiburg1_test'
     stamps = [f'1305031229.{528748 + 33333 * index:06d}' for index in range(len(images))]
     for stamp, image in zip(stamps, images):
@@ -104,7 +104,7 @@ def write_tum(root: Path, images: list[np.ndarray], poses: np.ndarray) -> tuple[
 
 def write_kitti(root: Path, images: list[np.ndarray], poses: np.ndarray,
                 camera: str = 'image_0') -> tuple[Path, list[int]]:
-    """Write sequences/03 and poses/03.txt; image_2 looks from 6 cm to the left of camera 0."""
+    """Write sequences/03 and poses/03.txt; the camera of image_2 is 6 cm left of camera 0."""
     folder = root / 'sequences' / '03'
     for index, image in enumerate(images):
         write_image(folder / camera / f'{index:06d}.png', image)
@@ -120,7 +120,7 @@ def write_kitti(root: Path, images: list[np.ndarray], poses: np.ndarray,
 
 def write_tartanair(root: Path, images: list[np.ndarray], poses: np.ndarray
                     ) -> tuple[Path, list[int]]:
-    """Write hospital/Easy/P000: x of the NED camera is forward, y right, z down."""
+    """Write hospital/Easy/P000; the NED camera has x forward, y right and z down."""
     folder = root / 'hospital' / 'Easy' / 'P000'
     for index, image in enumerate(images):
         write_image(folder / 'image_left' / f'{index:06d}_left.png', image)

@@ -116,7 +116,7 @@ def test_a_teacher_has_a_row_of_its_own(folder):
 
 def test_each_row_learned_what_it_says(done):
     told = {row: read_policy(done / f'{row}-1.safetensors') for row in TRAINED}
-    parts = {row: {name for name, _ in policy.setting.observation}
+    parts = {row: {name for name, _ in policy.signature.observation}
              for row, policy in told.items()}
     assert parts['full'] == {'descriptor', 'poses'}
     assert parts['local_signals_only'] and not parts['local_signals_only'] & parts['full']

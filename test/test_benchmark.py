@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""``python -m kfvo_ros.benchmark`` as users start it: runs that end well, badly and not at all."""
+"""``python -m kfvo_ros.benchmark``: runs that finish, fail and are interrupted."""
 
 from __future__ import annotations
 
@@ -35,8 +35,9 @@ pytestmark = pytest.mark.usefixtures('own_signals')
 
 COUNT = 16
 METHODS = ('every', 'learned')
-PROMISED = ['sequence', 'method', 'backbone', 'scale_rule', 'frames', 'keyframes', 'ate_rmse_m',
-            'path_length_m', 'ate_percent', 'rpe_trans', 'rpe_rot_deg', 'ms_per_frame', 'seed']
+INTERFACE_COLUMNS = [
+    'sequence', 'method', 'backbone', 'scale_rule', 'frames', 'keyframes', 'ate_rmse_m',
+    'path_length_m', 'ate_percent', 'rpe_trans', 'rpe_rot_deg', 'ms_per_frame', 'seed']
 PAGES = ('results.md', 'results.tex', 'results.html', 'trajectories.png', 'errors.png')
 
 
@@ -56,29 +57,29 @@ def write_room(root: Path) -> Path:
 
 @pytest.fixture(scope='module')
 def sequences(tmp_path_factory) -> list[Path]:
-    """Return one that is sound, one with a broken image and one without truth."""
+    """Return a valid one, one with a broken image and one without ground truth."""
     root = tmp_path_factory.mktemp('data')
-    sound = write_room(root)
-    broken, untrue = sound.with_name('04'), root / 'untrue'
-    shutil.copytree(sound, broken)
+    valid = write_room(root)
+    broken, without_truth = valid.with_name('04'), root / 'without_truth'
+    shutil.copytree(valid, broken)
     (broken / 'image_0' / '000012.png').write_bytes(b'no image')
-    untrue.mkdir()
-    write_camera_info(untrue, 30.0)
+    without_truth.mkdir()
+    write_camera_info(without_truth, 30.0)
     for index in range(2):
-        write_image(untrue / f'{index}.png', frames_of(1, COUNT)[0].image[:24, :32])
-    return [sound, broken, untrue]
+        write_image(without_truth / f'{index}.png', frames_of(1, COUNT)[0].image[:24, :32])
+    return [valid, broken, without_truth]
 
 
 @pytest.fixture(scope='module')
 def policy(tmp_path_factory) -> Path:
     """Return a policy that keeps every frame."""
     options = OdometryOptions()
-    setting = factory.signature_of(options, factory.make_backbone(options))
-    return write_policy(tmp_path_factory.mktemp('policy') / 'p.safetensors', setting, ALWAYS)
+    signature = factory.signature_of(options, factory.make_backbone(options))
+    return write_policy(tmp_path_factory.mktemp('policy') / 'p.safetensors', signature, ALWAYS)
 
 
 @pytest.fixture(scope='module')
-def done(sequences, policy, tmp_path_factory) -> tuple[Path, subprocess.CompletedProcess[str]]:
+def finished(sequences, policy, tmp_path_factory) -> tuple[Path, subprocess.CompletedProcess[str]]:
     folder = tmp_path_factory.mktemp('results')
     return folder, run_python(*command(sequences, policy, folder))
 
@@ -88,16 +89,16 @@ def command(sequences: list[Path], policy: Path, folder: Path, *more: object) ->
             policy, '--output', folder, *more]
 
 
-def test_a_row_for_each_run_and_two_that_never_look(done):
-    folder, outcome = done
+def test_a_row_for_each_run_and_two_trivial_baselines(finished):
+    folder, outcome = finished
     assert outcome.returncode == 0, outcome.stderr
     rows = rows_of(folder)
-    assert list(rows[0])[:len(PROMISED)] == PROMISED
+    assert list(rows[0])[:len(INTERFACE_COLUMNS)] == INTERFACE_COLUMNS
     assert [(row['sequence'], row['method'], row['status']) for row in rows] == [
         ('kitti/03', 'every', 'finished'), ('kitti/03', 'learned', 'finished'),
         ('kitti/03', 'constant_position', 'finished'), ('kitti/03', 'straight_line', 'finished'),
         ('kitti/04', 'every', 'failed'), ('kitti/04', 'learned', 'failed'),
-        ('untrue', 'every', 'finished'), ('untrue', 'learned', 'finished')]
+        ('without_truth', 'every', 'finished'), ('without_truth', 'learned', 'finished')]
     for row in rows[:2]:
         assert (row['backbone'], row['scale_rule'], row['seed']) == ('geometric', 'depth', '0')
         assert row['frames'] == row['keyframes'] == str(COUNT)
@@ -107,16 +108,16 @@ def test_a_row_for_each_run_and_two_that_never_look(done):
     assert float(rows[2]['ate_rmse_m']) > 10.0 * float(rows[0]['ate_rmse_m'])
 
 
-def test_the_error_is_that_of_the_files_of_the_run(done, sequences):
-    folder = done[0] / 'runs' / 'kitti_03' / 'every' / '0'
+def test_the_ate_is_that_of_the_files_of_the_run(finished, sequences):
+    folder = finished[0] / 'runs' / 'kitti_03' / 'every' / '0'
     truth = open_sequence(str(sequences[0])).ground_truth().trajectory
     error = absolute_trajectory_error(read_tum(folder / 'trajectory.tum'), truth)
-    assert float(rows_of(done[0])[0]['ate_rmse_m']) == pytest.approx(error.rmse, rel=1e-12)
+    assert float(rows_of(finished[0])[0]['ate_rmse_m']) == pytest.approx(error.rmse, rel=1e-12)
     assert {'keyframes.tum', 'summary.json'} <= {path.name for path in folder.iterdir()}
 
 
-def test_what_failed_says_why_and_the_others_go_on(done):
-    folder, outcome = done
+def test_a_failed_run_has_a_reason_and_the_others_continue(finished):
+    folder, outcome = finished
     failed = rows_of(folder)[4]
     assert '000012.png' in failed['problem'] and failed['ate_rmse_m'] == ''
     assert 'kitti/04, every, seed 0: ' in outcome.stderr
@@ -124,8 +125,8 @@ def test_what_failed_says_why_and_the_others_go_on(done):
     assert rows_of(folder)[6]['problem'] == 'no ground truth'
 
 
-def test_pages(done):
-    folder, outcome = done
+def test_report(finished):
+    folder, outcome = finished
     for name in PAGES:
         assert (folder / name).stat().st_size > 0, name
     page = (folder / 'results.md').read_text()
@@ -138,16 +139,17 @@ def test_pages(done):
     assert str(folder) not in page.replace(str(folder / 'runs'), '')
 
 
-def test_resuming_runs_only_what_is_not_finished(done, sequences, policy, tmp_path):
+def test_resuming_skips_finished_runs(finished, sequences, policy, tmp_path):
     folder = tmp_path / 'results'
-    shutil.copytree(done[0], folder)
-    runs = [folder / 'runs' / name / 'every' / '0' for name in ('kitti_03', 'kitti_04', 'untrue')]
+    shutil.copytree(finished[0], folder)
+    runs = [folder / 'runs' / name / 'every' / '0'
+            for name in ('kitti_03', 'kitti_04', 'without_truth')]
     before = [(run / 'request.json').stat().st_mtime_ns for run in runs]
     again = run_python(*command(sequences, policy, folder, '--resume', '--no-pictures'))
     assert again.returncode == 0, again.stderr
     after = [(run / 'request.json').stat().st_mtime_ns for run in runs]
     assert [old == new for old, new in zip(before, after)] == [True, False, True]
-    for old, new in zip(rows_of(done[0]), rows_of(folder), strict=True):
+    for old, new in zip(rows_of(finished[0]), rows_of(folder), strict=True):
         changing = [name for name in old if 'ms' in name or name == 'peak_rss_mb']
         assert [old[name] for name in old if name not in changing] == [
             new[name] for name in new if name not in changing]
@@ -156,8 +158,8 @@ def test_resuming_runs_only_what_is_not_finished(done, sequences, policy, tmp_pa
 @pytest.mark.parametrize(('more', 'part'), [
     (['--resume', '--window-size', '6'], '--window-size'), ([], 'already holds results.csv'),
     (['--resume', '--overwrite'], 'both came')])
-def test_results_of_something_else_are_not_mixed_in(more, part, done, sequences, policy, capsys):
-    folder = done[0]
+def test_results_of_other_options_are_rejected(more, part, finished, sequences, policy, capsys):
+    folder = finished[0]
     before = (folder / 'results.csv').read_bytes()
     methods = ['--methods', 'every'] if more else []
     arguments = [str(sequences[0]), *methods, '--output', str(folder), *more]
@@ -170,11 +172,11 @@ def test_results_of_something_else_are_not_mixed_in(more, part, done, sequences,
     assert (folder / 'results.csv').read_bytes() == before
 
 
-def test_another_policy_of_the_same_name_is_something_else(done, sequences, policy, capsys):
+def test_another_policy_of_the_same_name_is_rejected(finished, sequences, policy, capsys):
     kept = policy.read_bytes()
     try:
         write_policy(policy, PolicySignature('geometric', 'depth', 8, (('gap', 1),)), ALWAYS)
-        arguments = command(sequences[:1], policy, done[0], '--resume')[2:]
+        arguments = command(sequences[:1], policy, finished[0], '--resume')[2:]
         assert benchmark.main([str(each) for each in arguments]) == 1
     finally:
         policy.write_bytes(kept)
@@ -183,7 +185,7 @@ def test_another_policy_of_the_same_name_is_something_else(done, sequences, poli
 
 @pytest.mark.parametrize(('arguments', 'part'), [
     (['/no/such/place'], '/no/such/place does not exist'),
-    (['synthetic:0', '--methods', 'often'], "survival, learned, came 'often'"),
+    (['synthetic:0', '--methods', 'often'], "survival, parallax, learned, came 'often'"),
     (['synthetic:0', '--methods', 'every,'], "came ''"),
     (['synthetic:0', '--seeds', '1,x'], "seeds: expected whole numbers from 0 with commas in "
      "between, came '1,x'"),
@@ -192,26 +194,32 @@ def test_another_policy_of_the_same_name_is_something_else(done, sequences, poli
     (['synthetic:0', '--policy', '/no/policy'], 'cannot read the policy /no/policy'),
     (['synthetic:9-1'], 'synthetic:A-B'),
     (['synthetic:0', '--camera', '/no/camera.yaml'], '/no/camera.yaml')])
-def test_what_cannot_be_is_told_before_anything_runs(arguments, part, tmp_path, capsys):
+def test_invalid_arguments_are_rejected_before_any_run(arguments, part, tmp_path, capsys):
     assert benchmark.main([*arguments, '--output', str(tmp_path / 'out')]) == 1
     problems = capsys.readouterr().err.splitlines()
     assert len(problems) == 1 and part in problems[0]
     assert not (tmp_path / 'out' / 'runs').exists()
 
 
-def test_a_policy_for_something_else(policy, tmp_path, capsys):
+def test_a_policy_for_other_options_is_rejected(policy, tmp_path, capsys):
     assert benchmark.main(['synthetic:0', '--policy', str(policy), '--window-size', '6',
                            '--output', str(tmp_path / 'out')]) == 1
     assert 'window_size 8' in capsys.readouterr().err
 
 
-def test_a_folder_that_cannot_be_written(tmp_path, capsys):
+def test_a_folder_that_cannot_be_written_is_rejected(tmp_path, capsys):
     (tmp_path / 'file').write_text('in the way')
     assert benchmark.main(['synthetic:0', '--output', str(tmp_path / 'file' / 'out')]) == 1
     assert 'file/out' in capsys.readouterr().err
 
 
-def test_without_matplotlib_the_line_comes_at_once(tmp_path):
+def test_tables_need_no_matplotlib():
+    script = ("import sys; sys.modules['matplotlib'] = None; "
+              'import kfvo_ros.benchmark, kfvo_ros.evaluation.report')
+    assert run_python('-c', script).returncode == 0
+
+
+def test_missing_matplotlib_is_reported_before_any_run(tmp_path):
     script = ("import sys; sys.modules['matplotlib'] = None; "
               'from kfvo_ros.benchmark import main; sys.exit(main())')
     outcome = run_python('-c', script, 'synthetic:0', '--output', tmp_path / 'out')
@@ -219,7 +227,7 @@ def test_without_matplotlib_the_line_comes_at_once(tmp_path):
     assert not (tmp_path / 'out').exists()
 
 
-# What is not let to its end
+# Interrupted runs
 
 
 def children_of(process: subprocess.Popen[str]) -> list[int]:
@@ -249,21 +257,21 @@ def started(folder: Path, methods: str) -> Iterator[subprocess.Popen[str]]:
         process.communicate()
 
 
-def child_at_work(process: subprocess.Popen[str], folder: Path, method: str) -> int:
-    """Wait until a method has placed frames; return its process."""
+def wait_for_child(process: subprocess.Popen[str], folder: Path, method: str) -> int:
+    """Wait until a method has final poses; return the id of its process."""
     path = folder / 'runs' / 'synthetic_1_smooth' / method / '0' / 'trajectory.tum'
-    patience = time.monotonic() + 60.0
+    deadline = time.monotonic() + 60.0
     while not (path.exists() and path.read_text().count('\n') >= 3):
-        assert time.monotonic() < patience and process.poll() is None
+        assert time.monotonic() < deadline and process.poll() is None
         time.sleep(0.01)
     child, = children_of(process)
     return child
 
 
-def test_what_is_killed_is_a_row_and_ctrl_c_keeps_the_rows(tmp_path):
+def test_a_killed_run_has_a_row_and_ctrl_c_keeps_the_rows(tmp_path):
     with started(tmp_path, 'every,optical_flow,survival') as process:
-        os.kill(child_at_work(process, tmp_path, 'every'), signal.SIGKILL)
-        last = child_at_work(process, tmp_path, 'survival')
+        os.kill(wait_for_child(process, tmp_path, 'every'), signal.SIGKILL)
+        last = wait_for_child(process, tmp_path, 'survival')
         os.killpg(process.pid, signal.SIGINT)  # a terminal sends it to the children too
         problems = process.communicate(timeout=30.0)[1]
     assert process.returncode == 1 and 'Traceback' not in problems
@@ -277,9 +285,9 @@ def test_what_is_killed_is_a_row_and_ctrl_c_keeps_the_rows(tmp_path):
     assert not Path('/proc', str(last)).exists()
 
 
-def test_no_process_outlives_a_benchmark_that_is_ended(tmp_path):
+def test_no_process_outlives_a_terminated_benchmark(tmp_path):
     with started(tmp_path, 'every,survival') as process:
-        child = child_at_work(process, tmp_path, 'every')
+        child = wait_for_child(process, tmp_path, 'every')
         process.terminate()
         problems = process.communicate(timeout=30.0)[1]
     assert process.returncode == 1 and 'interrupted after 0 of 2 runs' in problems

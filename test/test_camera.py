@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Lens models against their formulas and their inverse, and calibration files good and bad."""
+"""Distortion models against their formulas and inverses, and calibration files."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def pixel_grid(camera: Camera) -> np.ndarray:
 
 
 def rays_within(degrees: float) -> np.ndarray:
-    """Return normalised coordinates (N, 2) in all directions up to an angle off the axis."""
+    """Return normalised coordinates (N, 2) of rays up to an angle off the axis."""
     angle, azimuth = np.meshgrid(np.radians(np.linspace(0, degrees, 30)),
                                  np.linspace(0, 2 * np.pi, 24, endpoint=False))
     radius = np.tan(angle).ravel()
@@ -42,14 +42,14 @@ def rays_within(degrees: float) -> np.ndarray:
 
 
 def project_by_formula(camera: Camera, points: np.ndarray) -> np.ndarray:
-    """Return the pixels that the published model of the camera gives."""
+    """Return the pixels by the published formula of the distortion model."""
     x, y = points.T
     radius2 = x * x + y * y
     if camera.distortion_model == 'equidistant':
         radius, angle = np.sqrt(radius2), np.arctan(np.sqrt(radius2))
         k = camera.distortion
-        bent = angle * (1 + sum(k[i] * angle ** (2 * i + 2) for i in range(4)))
-        factor = np.where(radius > 0, bent / np.where(radius > 0, radius, 1), 1.0)
+        distorted = angle * (1 + sum(k[i] * angle ** (2 * i + 2) for i in range(4)))
+        factor = np.where(radius > 0, distorted / np.where(radius > 0, radius, 1), 1.0)
         x, y = factor * x, factor * y
     elif camera.distortion:
         k1, k2, p1, p2, k3, k4, k5, k6 = (*camera.distortion, *[0.0] * 8)[:8]
@@ -64,41 +64,41 @@ def project_by_formula(camera: Camera, points: np.ndarray) -> np.ndarray:
 
 
 @every_camera
-def test_distort_follows_the_published_model(camera):
+def test_distort_is_the_published_model(camera):
     rays = rays_within(30.0)
     np.testing.assert_allclose(camera.distort(rays), project_by_formula(camera, rays), atol=1e-9)
 
 
 @every_camera
-def test_every_pixel_of_the_image_returns_to_itself(camera):
+def test_distort_inverts_undistort_at_every_pixel(camera):
     pixels = pixel_grid(camera)
     rays = camera.undistort(pixels)
-    seen = np.isfinite(rays).all(axis=1)
+    valid = np.isfinite(rays).all(axis=1)
     if camera is not FISHEYE:
-        assert seen.all()
-    np.testing.assert_allclose(camera.distort(rays[seen]), pixels[seen], rtol=0, atol=1e-6)
+        assert valid.all()
+    np.testing.assert_allclose(camera.distort(rays[valid]), pixels[valid], rtol=0, atol=1e-6)
 
 
 @every_camera
-def test_every_ray_returns_to_itself(camera):
+def test_undistort_inverts_distort_at_every_ray(camera):
     rays = rays_within(75.0 if camera is FISHEYE else 33.0)
     np.testing.assert_allclose(camera.undistort(camera.distort(rays)), rays, rtol=0, atol=1e-9)
 
 
-def test_the_fisheye_has_no_pinhole_coordinates_beyond_its_cone():
+def test_fisheye_rays_beyond_the_largest_angle_are_nan():
     pixels = pixel_grid(FISHEYE)
     rays = FISHEYE.undistort(pixels)
-    seen = np.isfinite(rays).all(axis=1)
-    assert np.isnan(rays[~seen]).all()
+    valid = np.isfinite(rays).all(axis=1)
+    assert np.isnan(rays[~valid]).all()
     radius = np.hypot(*((pixels - (FISHEYE.cx, FISHEYE.cy)) / (FISHEYE.fx, FISHEYE.fy)).T)
     angles = np.radians([79.9, 80.1])
     inside, outside = angles * (1 + sum(
         k * angles ** (2 * i + 2) for i, k in enumerate(FISHEYE.distortion)))
-    assert seen[radius < inside].all() and not seen[radius > outside].any()
+    assert valid[radius < inside].all() and not valid[radius > outside].any()
     assert (radius < inside).any() and (radius > outside).any()
 
 
-def test_rays_from_behind_a_fisheye_are_not_seen():
+def test_fisheye_rays_from_behind_are_nan():
     camera = Camera(2000, 2000, 300.0, 300.0, 1000.0, 1000.0, 'equidistant',
                     (1e-9, 0.0, 0.0, 0.0))
     angles = np.radians([60.0, 95.0, 120.0, 175.0])
@@ -107,26 +107,26 @@ def test_rays_from_behind_a_fisheye_are_not_seen():
     assert np.isnan(rays[1:]).all()
 
 
-def test_pixels_past_the_turning_point_of_a_lens_are_not_seen():
+def test_pixels_beyond_the_turning_point_of_the_polynomial_are_nan():
     camera = Camera(640, 480, 300.0, 300.0, 320.0, 240.0, 'plumb_bob', (-0.3, 0.0, 0.0, 0.0))
-    turn = 1.0 / math.sqrt(0.9)
-    farthest = 300.0 * turn * (1.0 - 0.3 * turn ** 2)
+    turning_point = 1.0 / math.sqrt(0.9)
+    farthest = 300.0 * turning_point * (1.0 - 0.3 * turning_point ** 2)
     offset = np.array([-1.001, -0.999, 0.0, 0.5, 0.999, 1.001]) * farthest
     rays = camera.undistort(np.column_stack([320.0 + offset, np.full(6, 240.0)]))
     assert np.isfinite(rays[:, 0]).tolist() == [False, True, True, True, True, False]
-    assert (np.abs(rays[1:5, 0]) < turn).all()
+    assert (np.abs(rays[1:5, 0]) < turning_point).all()
 
 
 @every_camera
-def test_odd_input_gives_nan_and_no_error(camera):
-    odd = camera.undistort(np.array([[np.nan, 3.0], [3.0, np.inf], [camera.cx, camera.cy]]))
-    assert not np.isfinite(odd[:2]).all(axis=1).any()
-    np.testing.assert_allclose(odd[2], 0.0, atol=1e-12)
+def test_non_finite_pixels_give_nan_and_no_error(camera):
+    rays = camera.undistort(np.array([[np.nan, 3.0], [3.0, np.inf], [camera.cx, camera.cy]]))
+    assert not np.isfinite(rays[:2]).all(axis=1).any()
+    np.testing.assert_allclose(rays[2], 0.0, atol=1e-12)
     assert camera.undistort(np.zeros((0, 2))).shape == (0, 2)
     assert camera.distort(np.zeros((0, 2))).shape == (0, 2)
 
 
-def test_matrix_projects():
+def test_matrix_projects_points_of_a_pinhole_camera():
     x, y, w = PINHOLE.matrix @ [0.2, -0.1, 2.0]
     np.testing.assert_allclose([[x / w, y / w]], PINHOLE.distort(np.array([[0.1, -0.05]])))
 
@@ -149,15 +149,15 @@ def test_plumb_bob_always_has_a_k3():
     assert four == Camera(4, 4, 1.0, 1.0, 2.0, 2.0, 'plumb_bob', (0.1, 0.2, 0.3, 0.4, 0.0))
 
 
-def test_zero_coefficients_are_no_distortion():
+def test_zero_coefficients_mean_no_distortion():
     camera = Camera(4, 4, 1.0, 1.0, 2.0, 2.0, 'plumb_bob', (0.0,) * 5)
     assert camera == Camera(4, 4, 1.0, 1.0, 2.0, 2.0)
-    # The ideal equidistant lens has zero coefficients and is no pinhole.
+    # The ideal equidistant model has zero coefficients and is no pinhole.
     fisheye = Camera(400, 400, 100.0, 100.0, 200.0, 200.0, 'equidistant', (0.0,) * 4)
     assert fisheye.distort(np.array([[1.0, 0.0]]))[0, 0] == pytest.approx(200 + 25 * math.pi)
 
 
-@pytest.mark.parametrize('change, problem', [
+@pytest.mark.parametrize('change, message', [
     ({'distortion_model': 'wobbly'}, "unknown distortion model 'wobbly'; expected one of"),
     ({'distortion': (0.1,)}, 'distortion coefficients, 1 came'),
     ({'distortion_model': 'equidistant', 'distortion': (0.1,) * 5}, 'distortion coefficients'),
@@ -166,15 +166,15 @@ def test_zero_coefficients_are_no_distortion():
     ({'cx': math.inf}, 'expected'), ({'distortion': (math.nan,) * 4}, 'expected'),
     ({'readout_s': 30.0}, 'readout_s=30.0'), ({'readout_s': math.nan}, 'readout_s=nan'),
     ({'width': 0}, 'came 0x480'), ({'height': -1}, 'came 640x-1')])
-def test_impossible_cameras_are_refused(change, problem):
+def test_invalid_cameras_are_refused(change, message):
     values = {'width': 640, 'height': 480, 'fx': 500.0, 'fy': 500.0, 'cx': 320.0, 'cy': 240.0,
               'distortion_model': 'plumb_bob', 'distortion': (0.1, 0.0, 0.0, 0.0)}
     Camera(**values)
-    with pytest.raises(KfvoError, match=problem):
+    with pytest.raises(KfvoError, match=message):
         Camera(**{**values, **change})
 
 
-def test_guess_sees_sixty_degrees_and_says_so():
+def test_guess_has_a_field_of_view_of_sixty_degrees():
     camera = guess_camera(1920, 1080)
     assert camera.guessed and not PINHOLE.guessed
     edges = camera.undistort(np.array([[-0.5, 539.5], [1919.5, 539.5]]))
@@ -187,7 +187,7 @@ def test_guess_sees_sixty_degrees_and_says_so():
 
 @pytest.mark.parametrize('camera', [EUROC, FISHEYE], ids=['euroc', 'fisheye'])
 @pytest.mark.parametrize('factor', [0.5, 0.25, 2.0])
-def test_scaled_sees_the_same_rays(camera, factor):
+def test_scaled_keeps_the_rays(camera, factor):
     small = camera.scaled(round(camera.width * factor), round(camera.height * factor))
     rays = rays_within(30.0)
     # Pixel centres are whole numbers, so the corner of the image is at -0.5.
@@ -195,7 +195,7 @@ def test_scaled_sees_the_same_rays(camera, factor):
                                atol=1e-9)
 
 
-def test_scaled_tells_resizing_from_cropping():
+def test_scaled_refuses_another_aspect_ratio():
     kitti = Camera(1241, 376, 718.856, 718.856, 607.1928, 185.2157)
     assert kitti.scaled(1241, 376) is kitti
     assert kitti.scaled(620, 188).width == 620
@@ -228,7 +228,7 @@ def test_a_calibration_is_read(tmp_path):
     assert read_camera_info(path).readout_s == 0.03
 
 
-@pytest.mark.parametrize('old, new, problem', [
+@pytest.mark.parametrize('old, new, message', [
     ('image_width: 640', '', "KeyError\\('image_width'\\)"),
     ('image_width: 640', 'image_width: wide', 'image_width'),
     ('image_width: 640', 'image_width: .inf', 'image_width'),
@@ -253,25 +253,25 @@ def test_a_calibration_is_read(tmp_path):
     ('640', '!!bool x', 'cannot read the calibration'),
     ('640', '!!int ""', 'cannot read the calibration'),
     ('640', '!!timestamp x', 'cannot read the calibration')])
-def test_a_bad_calibration_is_named(tmp_path, old, new, problem):
+def test_the_error_names_a_bad_calibration(tmp_path, old, new, message):
     assert old in CALIBRATION
     path = tmp_path / 'camera_info.yaml'
     path.write_text(CALIBRATION.replace(old, new, 1))
-    with pytest.raises(KfvoError, match=problem) as caught:
+    with pytest.raises(KfvoError, match=message) as caught:
         read_camera_info(path)
     assert str(path) in str(caught.value)
     assert '\n' not in str(caught.value)
 
 
 @pytest.mark.parametrize('text', ['', 'just words', '- a\n- list', '5', '\x00'])
-def test_what_is_no_calibration_at_all_is_refused(tmp_path, text):
+def test_a_file_without_a_calibration_is_refused(tmp_path, text):
     path = tmp_path / 'camera_info.yaml'
     path.write_text(text)
     with pytest.raises(KfvoError, match='camera_info.yaml'):
         read_camera_info(path)
 
 
-def test_a_calibration_that_cannot_be_read_is_named(tmp_path):
+def test_the_error_names_an_unreadable_calibration(tmp_path):
     with pytest.raises(KfvoError, match='cannot read the calibration .*missing.yaml'):
         read_camera_info(tmp_path / 'missing.yaml')
     (tmp_path / 'image.yaml').write_bytes(b'\x89PNG\xff\xfe')

@@ -4,28 +4,26 @@
 
 from __future__ import annotations
 
-import ast
+import importlib.util
 import json
 import os
-from dataclasses import fields
+import sys
+from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import yaml
 
 from kfvo_ros.camera import read_camera_info
-from kfvo_ros.odometry.options import OdometryOptions, VggtOptions
+from kfvo_ros.ros.options import node_parameters
 from kfvo_ros.sequences.tum import FREIBURG
 from kfvo_ros.utils.files import find_config
 
 ROOT = Path(__file__).resolve().parent.parent
+LAUNCH = ROOT / 'launch' / 'kfvo.launch.py'
 PRESETS = ('euroc', 'tum', 'kitti')
-
-
-def node_parameters() -> set[str]:
-    parameters = pytest.importorskip('kfvo_ros.ros.parameters', reason='rclpy is not installed')
-    return {field.name for kind in (OdometryOptions, VggtOptions, parameters.NodeOptions)
-            for field in fields(kind)}
 
 
 @pytest.mark.parametrize('name', PRESETS)
@@ -33,7 +31,7 @@ def test_preset_sets_parameters_that_exist(name: str) -> None:
     preset = yaml.safe_load((ROOT / 'config' / f'{name}.yaml').read_text())
     values = preset['/**']['ros__parameters']
     assert values['image_topic'].startswith('/')
-    assert set(values) <= node_parameters()
+    assert set(values) <= {each.name for each in node_parameters()}
     if 'camera_info_file' in values:
         read_camera_info(find_config(values['camera_info_file']))
 
@@ -62,14 +60,82 @@ def test_an_installed_config_folder_is_found(tmp_path: Path,
     assert find_config('of_my_robot.yaml') == installed
 
 
-def test_launch_arguments_are_parameters_of_the_node() -> None:
-    tree = ast.parse((ROOT / 'launch' / 'kfvo.launch.py').read_text())
-    tables = {node.targets[0].id: ast.literal_eval(node.value) for node in tree.body
-              if isinstance(node, ast.Assign) and node.targets[0].id in ('PARAMETERS', 'OTHERS')}
-    assert set(tables['PARAMETERS']) - {'use_sim_time'} <= node_parameters()
-    assert all(text for text in tables['PARAMETERS'].values())
+class FakeLaunch:
+    """Stands for the modules of launch, which has no wheels: records what is constructed."""
+
+    def __init__(self, *arguments: object, **keywords: object) -> None:
+        self.arguments, self.keywords = arguments, keywords
+
+    def perform(self, context: dict[str, str]) -> str:
+        """Return the value of a LaunchConfiguration in a context of arguments."""
+        return context[self.arguments[0]]
+
+
+@pytest.fixture
+def launch_file(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """Return the launch file as a module, with recording stand-ins for launch."""
+    names = ('Action', 'DeclareLaunchArgument', 'ExecuteProcess', 'OpaqueFunction', 'IfCondition',
+             'LaunchConfiguration', 'Node', 'LaunchContext', 'LaunchDescription')
+    classes = {name: type(name, (FakeLaunch,), {}) for name in names}
+    for module in ('launch', 'launch.action', 'launch.actions', 'launch.conditions',
+                   'launch.substitutions', 'launch_ros', 'launch_ros.actions'):
+        monkeypatch.setitem(sys.modules, module, SimpleNamespace(**classes))
+    spec = importlib.util.spec_from_file_location('kfvo_launch', LAUNCH)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    yield module
+
+
+def test_every_parameter_is_a_launch_argument(launch_file: Any) -> None:
+    actions = launch_file.generate_launch_description().arguments[0]
+    declared = {each.arguments[0]: each.keywords['description'] for each in actions
+                if type(each).__name__ == 'DeclareLaunchArgument'}
+    parameters = {each.name: each.description for each in node_parameters()}
+    assert len(parameters) >= 30
+    assert set(declared) == {*parameters, 'use_sim_time', 'preset', 'namespace', 'bag', 'rviz'}
+    assert all(declared[name].startswith(text) for name, text in parameters.items())
     for name in PRESETS:
-        assert name in tables['OTHERS']['preset'][1]
+        assert name in declared['preset']
+
+
+def test_launch_arguments_reach_the_node_in_their_types(launch_file: Any) -> None:
+    given = dict.fromkeys((*launch_file.PARAMETERS, *launch_file.OTHERS), '')
+    given |= {'preset': 'euroc', 'bag': 'a.bag', 'scale': '2', 'publish_tf': 'False',
+              'window_size': '5', 'keyframes': 'every', 'use_sim_time': 'true'}
+    node, player = launch_file._start(given)
+    preset, values = node.keywords['parameters']
+    assert Path(preset).samefile(ROOT / 'config' / 'euroc.yaml')
+    assert values == {'scale': 2.0, 'publish_tf': False, 'window_size': 5, 'keyframes': 'every',
+                      'use_sim_time': True}
+    assert [type(values[name]) for name in ('scale', 'window_size')] == [float, int]
+    assert player.keywords['cmd'][-2:] == ['a.bag', '--wait-for-subscribers']
+
+
+@pytest.mark.parametrize(('name', 'text', 'expected'), [
+    ('window_size', '2', 'a whole number of at least 3 and at most 32'),
+    ('keyframes', 'often', 'one of every, optical_flow, survival'),
+    ('publish_tf', 'perhaps', 'true or false'), ('scale', 'nan', 'a number of at least')])
+def test_a_wrong_launch_argument_is_named(launch_file: Any, name: str, text: str,
+                                          expected: str) -> None:
+    given = dict.fromkeys((*launch_file.PARAMETERS, *launch_file.OTHERS), '') | {name: text}
+    with pytest.raises(RuntimeError) as error:
+        launch_file._start(given)
+    assert f'launch argument {name}: expected {expected}' in str(error.value)
+    assert repr(text) in str(error.value)
+
+
+def test_the_documented_parameters_are_those_of_the_node() -> None:
+    lines = (ROOT / 'docs' / 'parameters.md').read_text().splitlines()
+    rows = [[cell.strip(' `') for cell in line.split(' | ')] for line in lines
+            if line.startswith('| `')]
+    documented = {name.lstrip('| `'): (default, text.rstrip(' |')) for name, default, text in rows}
+    assert list(documented) == [each.name for each in node_parameters()]
+    for each in node_parameters():
+        default, text = documented[each.name]
+        plain = '' if each.default is None else str(each.default)
+        assert default == (plain.lower() if isinstance(each.default, bool) else plain)
+        choices = f' ({", ".join(each.choices)})' if each.choices else ''
+        assert text.replace('`', '') == each.description + choices
 
 
 def test_rviz_shows_what_the_node_publishes() -> None:

@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""``python -m kfvo_ros.convert`` as users start it: errors, interruption, nothing overwritten."""
+"""The command ``python -m kfvo_ros.convert``: errors, interruption, nothing overwritten."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from bag_writers import COUNT
 from command_lines import assert_one_readable_line, run_interrupted, run_python
-from recordings import assert_same, write_sequence
+from recordings import assert_same_sequence, write_sequence
 
 from kfvo_ros.sequences import open_sequence
 from kfvo_ros.sequences.synthetic.sequence import SyntheticSequence
@@ -20,7 +20,7 @@ command = partial(run_python, '-m', 'kfvo_ros.convert')
 
 
 @pytest.mark.parametrize('taken', ['folder', 'file', 'dead link'])
-def test_nothing_is_overwritten_nor_read(taken, tmp_path):
+def test_an_existing_output_is_refused_before_reading(taken, tmp_path):
     bag = tmp_path / 'out'
     {'folder': bag.mkdir, 'file': bag.touch,
      'dead link': lambda: bag.symlink_to('nowhere')}[taken]()
@@ -41,7 +41,7 @@ def test_nothing_is_overwritten_nor_read(taken, tmp_path):
     (['broken'], ['0.png']),
     (['synthetic:7', '--stop', '0'], ['at least 1']),
 ])
-def test_what_cannot_be_leaves_nothing_behind(arguments, parts, tmp_path):
+def test_invalid_requests_leave_no_output(arguments, parts, tmp_path):
     if arguments[0] == 'tum':
         arguments = [write_sequence('tum', tmp_path), *arguments[1:]]
     if arguments[0] == 'broken':
@@ -51,14 +51,14 @@ def test_what_cannot_be_leaves_nothing_behind(arguments, parts, tmp_path):
     assert not (tmp_path / 'a').exists()
 
 
-def test_an_output_that_cannot_be(tmp_path):
+def test_invalid_outputs(tmp_path):
     source = write_sequence('folder', tmp_path)
     (tmp_path / 'file').touch()
     assert_one_readable_line(command(source, tmp_path / 'file' / 'out'), 'file/out')
     assert_one_readable_line(command(source, tmp_path / 'out.mcap'), 'out.mcap', 'folder')
 
 
-def test_times_that_ros_cannot_express(tmp_path):
+def test_stamps_outside_ros_time(tmp_path):
     source = write_sequence('tum', tmp_path)
     index = Path(source, 'rgb.txt')
     lines = index.read_text().splitlines()
@@ -69,20 +69,20 @@ def test_times_that_ros_cannot_express(tmp_path):
     assert len(list(open_sequence(str(tmp_path / 'out')))) == COUNT - 1
 
 
-def test_a_broken_image_in_the_middle_keeps_the_earlier_ones(tmp_path):
+def test_a_broken_image_keeps_the_earlier_ones(tmp_path):
     source = write_sequence('euroc', tmp_path)
     original = open_sequence(source)
-    third = sorted(Path(source).rglob('*.png'))[3]
-    third.write_bytes(b'no image at all')
+    fourth = sorted(Path(source).rglob('*.png'))[3]
+    fourth.write_bytes(b'no image at all')
     done = command(source, tmp_path / 'out')
-    assert_one_readable_line(done, third.name, '3 images before', str(tmp_path / 'out'))
+    assert_one_readable_line(done, fourth.name, '3 images before', str(tmp_path / 'out'))
     copy = open_sequence(str(tmp_path / 'out'))
     assert len(list(copy)) == len(copy.ground_truth().trajectory) == 3
     assert copy.camera == original.camera
 
 
 def test_a_full_disk(tmp_path):
-    """A limit on the size of files stands in for it: writing fails in the same place."""
+    """A limit on file sizes simulates it: writing fails in the same place."""
     script = ('import resource, sys; from kfvo_ros.convert import main; '
               'resource.setrlimit(resource.RLIMIT_FSIZE, (2 << 20, 2 << 20)); sys.exit(main())')
     done = run_python('-c', script, 'synthetic:7', tmp_path / 'out', '--stop', 20)
@@ -90,17 +90,17 @@ def test_a_full_disk(tmp_path):
 
 
 @pytest.mark.parametrize('sent', [signal.SIGINT, signal.SIGTERM])
-def test_interruption_keeps_what_was_written(sent, tmp_path):
+def test_interruption_keeps_the_written_images(sent, tmp_path):
     bag = tmp_path / 'out'
-    status, _, problems = run_interrupted(
+    status, _, errors = run_interrupted(
         sent, lambda: bag.exists() and any(file.stat().st_size > 1 << 20
                                            for file in bag.iterdir()),
         '-m', 'kfvo_ros.convert', 'synthetic:7', bag)
-    assert status == 1 and 'Traceback' not in problems
+    assert status == 1 and 'Traceback' not in errors
     copy = open_sequence(str(bag))
-    assert f'interrupted; the {copy.length} images before' in problems.splitlines()[-1]
+    assert f'interrupted; the {copy.length} images before' in errors.splitlines()[-1]
     assert 3 <= copy.length < 200
-    assert_same(SyntheticSequence(7), copy, copy.length)
+    assert_same_sequence(SyntheticSequence(7), copy, copy.length)
 
 
 def test_help():

@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The commands that show the whole way: rendered room, bag, node, player, evaluation."""
+"""The demonstration and the node benchmark: sequence, bag, node, player, evaluation."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ pytest.importorskip('matplotlib', reason="matplotlib is not installed: pip insta
 SEQUENCE = 'synthetic:0:fast'
 
 
-def test_demo_ends_with_trajectory_summary_and_picture(tmp_path: Path) -> None:
+def test_demo_writes_trajectory_summary_and_plot(tmp_path: Path) -> None:
     folder = tmp_path / 'demo'
     outcome = run_module('kfvo_ros.demo', '--output', folder, '--sequence', SEQUENCE,
                          timeout=120.0)
@@ -33,14 +33,14 @@ def test_demo_ends_with_trajectory_summary_and_picture(tmp_path: Path) -> None:
     assert summary['poses'] == len(poses) == summary['frames'] - summary['dropped']
     assert summary['frames'] == 200
     assert 0 < summary['keyframes'] <= summary['poses']
-    # How many frames a busy machine drops is not the matter here.
+    # The number of dropped frames depends on the load of the machine.
     assert summary['ate_rmse_m'] < 0.05 * summary['path_length_m']
-    picture = cv2.imread(str(folder / 'trajectory.png'))
-    assert picture.shape[0] >= 480 and picture.std() > 5.0
+    plot = cv2.imread(str(folder / 'trajectory.png'))
+    assert plot.shape[0] >= 480 and plot.std() > 5.0
     assert 'ATE after Sim(3)' in outcome.stdout
 
 
-def test_demo_wants_ground_truth(tmp_path: Path) -> None:
+def test_demo_requires_ground_truth(tmp_path: Path) -> None:
     images = tmp_path / 'images'
     images.mkdir()
     cv2.imwrite(str(images / '0.png'), np.zeros((24, 32), dtype=np.uint8))
@@ -50,7 +50,7 @@ def test_demo_wants_ground_truth(tmp_path: Path) -> None:
     assert 'Traceback' not in outcome.stderr
 
 
-def test_a_node_that_does_not_start_is_not_waited_for(tmp_path: Path) -> None:
+def test_a_node_that_does_not_start_ends_the_run(tmp_path: Path) -> None:
     with pytest.raises(KfvoError, match='kfvo_node does not run'):
         run_node(tmp_path / 'bag', '/image', {'window_size': 2})
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from kfvo_ros import geometry
+from kfvo_ros.errors import KfvoError
 from kfvo_ros.geometry import Similarity, umeyama
 
 ANGLES = [0.0, 1e-300, 1e-16, 1e-9, 1e-6, 1e-3, 0.5, 1.0, 3.0, np.pi - 1e-3, np.pi - 1e-6,
@@ -39,7 +40,7 @@ def test_skew_is_the_cross_product():
     np.testing.assert_allclose(geometry.skew(v) @ u, np.cross(v, u), atol=1e-15)
 
 
-def test_exp_turns_right_handed_about_the_axis():
+def test_exp_rotates_right_handed_about_the_axis():
     quarter = geometry.exp_so3([0.0, 0.0, np.pi / 2])
     np.testing.assert_allclose(quarter @ [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], atol=1e-15)
 
@@ -114,25 +115,33 @@ def test_invert_and_relative():
     np.testing.assert_allclose(T_w_a @ T_a_b, T_w_b, atol=1e-13)
 
 
-def test_orthonormalise_takes_out_small_errors_and_nothing_else():
+def test_as_rigid_transform_reads_rows_and_refuses_the_rest():
+    pose = random_poses(1)[0]
+    np.testing.assert_array_equal(geometry.as_rigid_transform(pose.ravel().tolist(), 'T'), pose)
+    for numbers in (None, 'x', [1.0] * 15, 2.0 * pose, pose.T, np.full((4, 4), np.nan)):
+        with pytest.raises(KfvoError, match='^sensor.yaml: expected a rigid 4x4 transform'):
+            geometry.as_rigid_transform(numbers, 'sensor.yaml')
+
+
+def test_orthonormalise_removes_small_errors_only():
     poses = random_poses(50)
-    worn = poses.copy()
-    worn[:, :3, :3] += np.random.default_rng(1).normal(scale=1e-7, size=(50, 3, 3))
-    mended = geometry.orthonormalise(worn)
-    assert_rotations(mended[:, :3, :3])
-    np.testing.assert_allclose(mended, poses, rtol=0, atol=1e-6)
-    np.testing.assert_array_equal(mended[:, :3, 3], poses[:, :3, 3])
+    noisy = poses.copy()
+    noisy[:, :3, :3] += np.random.default_rng(1).normal(scale=1e-7, size=(50, 3, 3))
+    result = geometry.orthonormalise(noisy)
+    assert_rotations(result[:, :3, :3])
+    np.testing.assert_allclose(result, poses, rtol=0, atol=1e-6)
+    np.testing.assert_array_equal(result[:, :3, 3], poses[:, :3, 3])
     np.testing.assert_allclose(geometry.orthonormalise(poses), poses, rtol=0, atol=1e-15)
 
 
-def test_similarity_maps_poses_like_points():
+def test_similarity_transforms_poses_like_points():
     similarity = Similarity(2.5, random_rotations(1)[0], np.array([1.0, -2.0, 3.0]))
     poses = random_poses(10)
-    moved = similarity.transform_poses(poses)
-    assert_rotations(moved[:, :3, :3])
+    transformed = similarity.transform_poses(poses)
+    assert_rotations(transformed[:, :3, :3])
     x = np.array([0.3, -0.7, 1.1])
     in_source = (poses @ np.append(x, 1.0))[:, :3]
-    in_target = (moved @ np.append(2.5 * x, 1.0))[:, :3]
+    in_target = (transformed @ np.append(2.5 * x, 1.0))[:, :3]
     np.testing.assert_allclose(similarity.transform_points(in_source), in_target, atol=1e-13)
 
 
@@ -155,7 +164,7 @@ def test_umeyama_without_scale_keeps_scale_one():
     np.testing.assert_allclose(found.rotation, rotation, atol=1e-12)
 
 
-def test_umeyama_is_a_minimum():
+def test_umeyama_minimises_the_squared_distance():
     rng = np.random.default_rng(4)
     source, target = rng.normal(size=(2, 30, 3))
 
@@ -164,13 +173,14 @@ def test_umeyama_is_a_minimum():
 
     best = umeyama(source, target)
     for _ in range(200):
-        factor, turn, shift = 1 + 1e-3 * rng.normal(), *(1e-3 * rng.normal(size=(2, 3)))
+        factor, rotation_vector, shift = 1 + 1e-3 * rng.normal(), *(
+            1e-3 * rng.normal(size=(2, 3)))
         assert cost(best) <= cost(Similarity(best.scale * factor,
-                                             geometry.exp_so3(turn) @ best.rotation,
+                                             geometry.exp_so3(rotation_vector) @ best.rotation,
                                              best.translation + shift))
 
 
-def test_umeyama_never_answers_with_a_reflection():
+def test_umeyama_never_returns_a_reflection():
     source = np.random.default_rng(5).normal(size=(40, 3))
     mirrored = source * [1.0, 1.0, -1.0]
     for target in (mirrored, mirrored @ random_rotations(1)[0].T):
@@ -180,7 +190,7 @@ def test_umeyama_never_answers_with_a_reflection():
 
 
 @pytest.mark.parametrize('spread', [[1.0, 1.0, 0.0], [1.0, 0.0, 0.0]], ids=['plane', 'line'])
-def test_umeyama_maps_flat_sets_exactly(spread):
+def test_umeyama_is_exact_for_coplanar_and_collinear_points(spread):
     source = np.random.default_rng(6).normal(size=(20, 3)) * spread
     truth = Similarity(0.3, random_rotations(1, seed=8)[0], np.array([1.0, 2.0, 3.0]))
     found = umeyama(source, truth.transform_points(source))

@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Every encoding against pixels packed by hand, and every refusal."""
+"""Image encodings against pixels packed by hand, and invalid images."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ PATTERNS = {'rggb': ((0, 1), (1, 2)), 'bggr': ((2, 1), (1, 0)),
 
 
 def pack(pixels: np.ndarray, padding: int) -> tuple[int, np.ndarray]:
-    """Return step and bytes of an image with so many bytes of rubbish after each row."""
+    """Return step and bytes of an image with `padding` bytes after each row."""
     rows = np.ascontiguousarray(pixels).reshape(len(pixels), -1).view(np.uint8)
-    rubbish = np.full((len(rows), padding), 0xA5, dtype=np.uint8)
-    return rows.shape[1] + padding, np.hstack([rows, rubbish]).ravel()
+    filler = np.full((len(rows), padding), 0xA5, dtype=np.uint8)
+    return rows.shape[1] + padding, np.hstack([rows, filler]).ravel()
 
 
 @pytest.mark.parametrize('padding', [0, 5])
@@ -43,7 +43,7 @@ def test_eight_bits(encoding, padding):
 @pytest.mark.parametrize('padding', [0, 6])
 @pytest.mark.parametrize('is_bigendian', [False, True])
 @pytest.mark.parametrize('encoding', DEEP)
-def test_sixteen_bits_give_their_high_byte(encoding, is_bigendian, padding):
+def test_sixteen_bits_keep_their_high_byte(encoding, is_bigendian, padding):
     stored, expected = DEEP[encoding]
     low = np.random.default_rng(1).integers(0, 256, stored.shape)
     deep = (stored.astype(int) * 256 + low).astype('>u2' if is_bigendian else '<u2')
@@ -54,7 +54,7 @@ def test_sixteen_bits_give_their_high_byte(encoding, is_bigendian, padding):
 @pytest.mark.parametrize('bits', [8, 16])
 @pytest.mark.parametrize('pattern', PATTERNS)
 def test_bayer(pattern, bits):
-    """A mosaic of one colour is that colour everywhere."""
+    """The mosaic of a uniform colour decodes to that colour."""
     colour = np.array([200, 90, 30])
     tile = colour[np.array(PATTERNS[pattern])]
     mosaic = np.tile(tile, (8, 8))
@@ -102,7 +102,7 @@ def test_the_image_owns_its_memory(container):
     ('mono8', 0, 2, 2, 0, '2x0'),
     ('yuv422', 1, 3, 6, 6, 'even width of yuv422.*3 came'),
 ])
-def test_sizes_that_do_not_fit_are_refused(encoding, height, width, step, size, message):
+def test_inconsistent_sizes_are_refused(encoding, height, width, step, size, message):
     with pytest.raises(KfvoError, match=message):
         decode_image(encoding, height, width, step, False, bytes(size))
 
@@ -123,7 +123,7 @@ def png(pixels: np.ndarray) -> bytes:
     (BGR, 'png', RGB),
     (BGR, 'rgb8; png compressed bgr8', RGB),
     (BGR, 'bgr8; png compressed bgr8', RGB),
-    (RGB, 'rgb8; png compressed ', RGB),  # compressed in the order of the message
+    (RGB, 'rgb8; png compressed ', RGB),  # compressed in the channel order of the message
     (np.dstack([BGR, ALPHA]), 'bgra8; png compressed bgr8', RGB),
     (GREY.astype(np.uint16) * 256 + 200, 'mono16; png compressed ', GREY),
     (BGR.astype(np.uint16) * 256 + 200, 'png', RGB),
@@ -145,7 +145,7 @@ def test_jpeg():
     assert np.abs(decode_compressed(data.reshape(-1), 'jpeg').astype(int) - smooth).max() < 12
 
 
-def test_what_is_no_picture_is_refused():
+def test_bytes_that_are_no_image_are_refused():
     floats = cv2.imencode('.tiff', np.ones((4, 4), np.float32))[1].tobytes()
     for data in (b'', b'no picture at all', png(GREY)[:20], floats):
         with pytest.raises(KfvoError, match='expected a JPEG, PNG'):
@@ -163,12 +163,12 @@ def test_files(tmp_path):
         read_image(tmp_path / 'broken.png')
 
 
-def test_exif_orientation_does_not_turn_a_calibrated_image(tmp_path):
+def test_exif_orientation_is_ignored(tmp_path):
     data = cv2.imencode('.jpg', np.zeros((6, 8), np.uint8))[1].tobytes()
-    # A TIFF directory of one entry: tag 0x0112 (orientation), SHORT, one value, 6 (turn right).
+    # A TIFF directory of one entry: tag 0x0112 (orientation), SHORT, one value, 6 (rotate 90).
     exif = b'Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0'
     segment = b'\xff\xe1' + (len(exif) + 2).to_bytes(2, 'big') + exif
-    path = tmp_path / 'turned.jpg'
+    path = tmp_path / 'rotated.jpg'
     path.write_bytes(data[:2] + segment + data[2:])
     assert cv2.imread(str(path)).shape[:2] == (8, 6)
     assert read_image(path).shape == (6, 8)

@@ -30,7 +30,7 @@ from kfvo_ros.keyframes.learned import read_policy
 from kfvo_ros.training.plan import TrainingFiles
 from kfvo_ros.training.ppo import Training
 from kfvo_ros.utils.files import find_config
-from kfvo_ros.utils.process import SIGNALS
+from kfvo_ros.utils.signals import SIGNALS
 
 pytestmark = pytest.mark.usefixtures('own_signals')
 

@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Stamps without floats, matching in time, and trajectory files good and bad."""
+"""Stamps without floats, association in time, and trajectory files."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_stamps_are_parsed_exactly(text, stamp_ns):
     assert parse_stamp_ns(text) == stamp_ns
 
 
-def test_any_decimal_number_gives_its_nanoseconds():
+def test_random_decimal_numbers_are_parsed_exactly():
     rng = np.random.default_rng(0)
     for _ in range(2000):
         whole = str(rng.integers(0, 10 ** int(rng.integers(1, 9))))
@@ -68,7 +68,7 @@ def test_stamps_survive_the_round_trip():
 @pytest.mark.parametrize('text', [
     '', ' ', '.', '-', 'e5', '1e', '1e1_0', '1_000', '--5', '+-5', '1.2.3', '1.-5', '1e5e6', '1 2',
     '0x10', 'nan', 'inf', '1,5', '\u0967', '\u00b2'])
-def test_what_is_no_decimal_number_is_refused(text):
+def test_text_that_is_no_decimal_number_is_refused(text):
     with pytest.raises(ValueError):
         parse_stamp_ns(text)
 
@@ -93,7 +93,7 @@ def test_path_length_and_positions():
     assert trajectory.select(np.zeros(0, dtype=int)).path_length == 0.0
 
 
-def test_select_keeps_what_belongs_together():
+def test_select_keeps_stamps_poses_and_the_kind_of_measurement():
     trajectory = random_trajectory()
     points = Trajectory(trajectory.stamps_ns, trajectory.poses, has_rotation=False)
     chosen = points.select(np.array([7, 2]))
@@ -102,10 +102,10 @@ def test_select_keeps_what_belongs_together():
     assert not chosen.has_rotation
 
 
-def test_moved_goes_to_the_other_body():
+def test_right_multiplied_gives_the_pose_of_the_mounted_frame():
     trajectory = random_trajectory()
     T_body_camera = geometry.make_transform(geometry.exp_so3([0.1, 0.2, 0.3]), [1.0, 2.0, 3.0])
-    camera = trajectory.moved(T_body_camera)
+    camera = trajectory.right_multiplied(T_body_camera)
     origin_in_body = T_body_camera @ [0.0, 0.0, 0.0, 1.0]
     np.testing.assert_allclose(camera.positions, (trajectory.poses @ origin_in_body)[:, :3],
                                atol=1e-12)
@@ -115,14 +115,14 @@ def test_moved_goes_to_the_other_body():
 
 
 def brute_force(stamps: list[int], reference: list[int], limit: int) -> set[tuple[int, int]]:
-    """Return (stamp index, reference stamp): every stamp wants its nearest, the nearer wins."""
-    wanted: dict[int, tuple[int, int]] = {}
+    """Return the pairs (stamp index, reference stamp) by the definition of `associate`."""
+    best: dict[int, tuple[int, int]] = {}
     for index, stamp in enumerate(stamps):
         nearest = min(reference, key=lambda r: (abs(r - stamp), r))
         distance = abs(nearest - stamp)
-        if distance <= limit and distance < wanted.get(nearest, (limit + 1, 0))[0]:
-            wanted[nearest] = (distance, index)
-    return {(index, value) for value, (_, index) in wanted.items()}
+        if distance <= limit and distance < best.get(nearest, (limit + 1, 0))[0]:
+            best[nearest] = (distance, index)
+    return {(index, value) for value, (_, index) in best.items()}
 
 
 @pytest.mark.parametrize('seed', range(200))
@@ -158,7 +158,7 @@ def test_association_by_hand(stamps, reference, pairs):
     assert list(zip(chosen, nearest)) == pairs
 
 
-def test_association_tells_single_nanoseconds_apart():
+def test_association_resolves_single_nanoseconds():
     chosen, nearest = associate(np.array([EPOCH_NS]), EPOCH_NS + np.array([-2, 1, 3]), 1)
     assert (chosen.tolist(), nearest.tolist()) == ([0], [1])
 
@@ -178,7 +178,7 @@ def test_tum_files_survive_the_round_trip(tmp_path):
     np.testing.assert_allclose(again.poses, trajectory.poses, rtol=0, atol=3e-9)
 
 
-def test_a_tum_line_by_hand():
+def test_a_tum_line_against_known_text():
     T_world_camera = geometry.make_transform(geometry.exp_so3([0.0, 0.0, np.pi]), [1, -2, 0.5])
     assert format_tum_line(EPOCH_NS, T_world_camera).split() == [
         '1403715273.262142976', '1.000000000', '-2.000000000', '0.500000000',
@@ -200,7 +200,7 @@ def test_tum_files_may_have_comments_commas_and_blank_lines(tmp_path):
     '1 2 3', '1 0 0 0 0 0 0', '1 0 0 0 0 0 0 1 9', 'x 0 0 0 0 0 0 1', '1 0 0 zero 0 0 0 1',
     '1 nan 0 0 0 0 0 1', '1 inf 0 0 0 0 0 1', 'nan 0 0 0 0 0 0 1', '1 0 0 0 0 0 0 0',
     '1 0 0 0 0 0 0 1e-200', '1e20 0 0 0 0 0 0 1', ','])
-def test_a_bad_tum_line_is_named(tmp_path, line):
+def test_the_error_names_a_bad_tum_line(tmp_path, line):
     path = tmp_path / 'bad.tum'
     path.write_text(f'# header\n0 0 0 0 0 0 0 1\n{line}\n')
     with pytest.raises(KfvoError, match='bad.tum, line 3: expected "stamp tx ty tz') as caught:
@@ -223,7 +223,7 @@ def test_kitti_poses_are_read(tmp_path):
     np.testing.assert_array_equal(again.stamps_ns, trajectory.stamps_ns)
 
 
-def test_kitti_rotations_are_rotations_despite_few_digits(tmp_path):
+def test_kitti_rotations_are_orthonormal_despite_few_digits(tmp_path):
     trajectory = random_trajectory()
     write_kitti(tmp_path / '03.txt', trajectory.poses, decimals=6)
     rotations = read_kitti_poses(tmp_path / '03.txt', trajectory.stamps_ns).poses[:, :3, :3]
@@ -234,7 +234,7 @@ def test_kitti_rotations_are_rotations_despite_few_digits(tmp_path):
 
 @pytest.mark.parametrize('line', ['1 2 3', '1 0 0 0 0 1 0 0 0 0 1', '1 0 0 0 0 1 0 0 0 0 1 x',
                                   '1 0 0 0 0 1 0 0 0 0 1 nan'])
-def test_a_bad_kitti_line_is_named(tmp_path, line):
+def test_the_error_names_a_bad_kitti_line(tmp_path, line):
     path = tmp_path / '03.txt'
     path.write_text(f'1 0 0 0 0 1 0 0 0 0 1 0\n{line}\n')
     with pytest.raises(KfvoError, match='03.txt, line 2: expected "12 numbers"'):
@@ -259,7 +259,7 @@ def test_kitti_poses_must_be_one_per_frame(tmp_path):
 
 @pytest.mark.parametrize('read', [read_tum, lambda path: read_kitti_poses(path, np.arange(2))],
                          ids=['tum', 'kitti'])
-def test_files_that_cannot_be_read_are_named(tmp_path, read):
+def test_the_error_names_an_unreadable_file(tmp_path, read):
     with pytest.raises(KfvoError, match='cannot read .*missing.txt'):
         read(tmp_path / 'missing.txt')
     with pytest.raises(KfvoError, match='cannot read'):

@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Trajectories to measure: by hand, at random, disturbed, and those of the data folder."""
+"""Trajectories for the tests of metrics: by hand, random, perturbed, and real ones."""
 
 from __future__ import annotations
 
@@ -20,11 +20,13 @@ MILLISECOND = 1_000_000
 
 
 def trajectory(positions, step_ms: int = 100, rotation_vectors=None) -> Trajectory:
-    """Return poses at regular stamps, not turning unless told."""
+    """Return poses at regular stamps, without rotation by default."""
     positions = np.asarray(positions, dtype=np.float64)
-    turns = np.zeros_like(positions) if rotation_vectors is None else rotation_vectors
+    if rotation_vectors is None:
+        rotation_vectors = np.zeros_like(positions)
     stamps_ns = EPOCH_NS + np.arange(len(positions)) * step_ms * MILLISECOND
-    return Trajectory(stamps_ns, geometry.make_transform(geometry.exp_so3(turns), positions))
+    rotations = geometry.exp_so3(rotation_vectors)
+    return Trajectory(stamps_ns, geometry.make_transform(rotations, positions))
 
 
 def along_x(*x: float) -> Trajectory:
@@ -32,8 +34,8 @@ def along_x(*x: float) -> Trajectory:
     return trajectory([[value, 0.0, 0.0] for value in x])
 
 
-def wandering(seed: int, count: int = 150) -> Trajectory:
-    """Return a random walk in position and rotation that pauses twice."""
+def random_walk(seed: int, count: int = 150) -> Trajectory:
+    """Return a random walk in position and rotation with two pauses."""
     rng = np.random.default_rng(seed)
     steps = geometry.make_transform(geometry.exp_so3(rng.normal(0, 0.1, (count, 3))),
                                     rng.normal(0.2, 0.3, (count, 3)))
@@ -45,8 +47,8 @@ def wandering(seed: int, count: int = 150) -> Trajectory:
                       np.array(poses))
 
 
-def disturbed(truth: Trajectory, seed: int, trans: float = 0.05, rot: float = 0.02) -> Trajectory:
-    """Return the truth with drift, noise and a world and scale of its own."""
+def perturbed(truth: Trajectory, seed: int, trans: float = 0.05, rot: float = 0.02) -> Trajectory:
+    """Return the truth with drift and noise, in another world frame and scale."""
     rng = np.random.default_rng(seed)
     count = len(truth)
     drift = np.cumsum(rng.normal(0, trans, (count, 3)), axis=0) / 3
@@ -64,17 +66,17 @@ def stamps_of(path: Path) -> np.ndarray:
 
 
 def freiburg1_rpy(data_path: Callable[[str], Path]) -> tuple[np.ndarray, Trajectory]:
-    """Return the stamps of the frames and the ground truth, or skip the test."""
+    """Return the frames' stamps and the ground truth, or skip the test."""
     folder = data_path('tum/rgbd_dataset_freiburg1_rpy')
     return stamps_of(folder / 'rgb.txt'), read_tum(folder / 'groundtruth.txt')
 
 
 def evo_data(name: str) -> Path:
-    """Return one of the published trajectories that evo is tested with, or skip the test."""
+    """Return one of the published trajectories in evo's own tests, or skip the test."""
     evo = pytest.importorskip('evo', reason='evo is not installed')
     folder = Path(os.environ.get('EVO_DATA') or Path(evo.__file__).parents[1] / 'test' / 'data')
     if not (folder / name).exists():
-        pytest.skip("evo's trajectories are not in its wheel: let EVO_DATA name the folder "
+        pytest.skip("evo's trajectories are not in its wheel: set EVO_DATA to the folder "
                     'test/data of its source (pip download --no-deps --no-binary :all: evo)')
     return folder / name
 

@@ -1,9 +1,9 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""VGGT models of known weights, made by recipe; what imports this skips where torch is missing.
+"""VGGT models of reproducible weights; tests that import this are skipped without torch.
 
-The recipe, and the arrays in data/vggt that the official model gave with it, are described in
-the data's origin: every tensor comes from a generator seeded by the CRC-32 of its own name.
+Every tensor comes from a generator seeded by the CRC-32 of its own name. The arrays in data/vggt
+are the official model's output with the same weights.
 """
 
 from __future__ import annotations
@@ -32,16 +32,15 @@ from torch import Tensor, nn  # noqa: E402
 
 from kfvo_ros.backbones.base import Window  # noqa: E402
 from kfvo_ros.backbones.vggt.backbone import VggtBackbone  # noqa: E402
-from kfvo_ros.backbones.vggt.config import VggtConfig, config_of  # noqa: E402
-from kfvo_ros.backbones.vggt.model import Vggt  # noqa: E402
-from kfvo_ros.backbones.vggt.runtime import set_precision  # noqa: E402
+from kfvo_ros.backbones.vggt.config import VggtConfig, config_from_shapes  # noqa: E402
+from kfvo_ros.backbones.vggt.model import Vggt, set_precision  # noqa: E402
 from kfvo_ros.sequences.base import Frame  # noqa: E402
 
 DATA = Path(__file__).with_name('data') / 'vggt'
-SMALL = VggtConfig(width=128, trunk_depth=2, depth=3, camera_depth=1, grid=7)
-"""Every kind of layer there is, and no more of them than that takes."""
+SMALL_CONFIG = VggtConfig(width=128, dinov2_depth=2, depth=3, camera_depth=1, grid=7)
+"""The smallest model that has every kind of layer."""
 WIDTH = 70
-"""Image width for a small model [px]; images of 4:3 have 4 rows of 5 patches then."""
+"""Image width for the small model [px]; images of 4:3 then have 4 rows of 5 patches."""
 COMPILER = os.environ.get('CXX') or 'g++'
 needs_compiler = pytest.mark.skipif(
     shutil.which(COMPILER) is None,
@@ -50,8 +49,8 @@ TOKENS = ('cls_token', 'register_tokens', 'mask_token', 'pos_embed', 'camera_tok
           'register_token', 'empty_pose_tokens')
 
 
-def weight(key: str, shape: Sequence[int]) -> np.ndarray:
-    """Return the tensor of this name, float32, by the recipe."""
+def make_tensor(key: str, shape: Sequence[int]) -> np.ndarray:
+    """Return the float32 tensor of a checkpoint key."""
     leaf, deviation, centre = key.rpartition('.')[2], 0.02, np.float32(0.0)
     if leaf == 'gamma':
         deviation, centre = 0.05, np.float32(0.5)
@@ -68,43 +67,43 @@ def weight(key: str, shape: Sequence[int]) -> np.ndarray:
     return rng.standard_normal(tuple(shape), dtype=np.float32) * np.float32(deviation) + centre
 
 
-def model_of(shapes: dict[str, tuple[int, ...]]) -> Vggt:
-    """Return the model of these tensors, by the recipe."""
+def make_model(shapes: dict[str, tuple[int, ...]]) -> Vggt:
+    """Return the model whose checkpoint has these keys and shapes."""
     with torch.device('meta'):
-        model = Vggt(config_of(shapes))
-    tensors = {key: torch.from_numpy(weight(key, shape)) for key, shape in shapes.items()}
+        model = Vggt(config_from_shapes(shapes))
+    tensors = {key: torch.from_numpy(make_tensor(key, shape)) for key, shape in shapes.items()}
     model.load_state_dict(tensors, assign=True)
     return model.eval().requires_grad_(False)
 
 
 @cache
 def small_model() -> Vggt:
-    """Return a model of SMALL sizes; not to be changed."""
+    """Return the model of SMALL_CONFIG, shared by all tests: never modify it."""
     with torch.device('meta'):
-        like = Vggt(SMALL)
-    return model_of({key: tuple(each.shape) for key, each in like.state_dict().items()})
+        model = Vggt(SMALL_CONFIG)
+    return make_model({key: tuple(each.shape) for key, each in model.state_dict().items()})
 
 
-def saved_small(path: Path) -> Path:
+def save_small_model(path: Path) -> Path:
     """Write the small model to a .safetensors file."""
     save_file(dict(small_model().state_dict()), path)
     return path
 
 
-def changed(model: Vggt, dtype: torch.dtype) -> Vggt:
+def with_precision(model: Vggt, dtype: torch.dtype) -> Vggt:
     """Return a copy with its matrices in `dtype`."""
     return set_precision(copy.deepcopy(model), dtype)
 
 
 @cache
 def published_shapes() -> dict[str, tuple[int, ...]]:
-    """Return the shape of every tensor in the checkpoint of VGGT-1B."""
+    """Return the keys and shapes of the checkpoint of VGGT-1B."""
     keys = json.loads((DATA / 'manifest_1b.json').read_text())['keys']
     return {key: tuple(shape) for key, shape in keys}
 
 
-def images_of(seed: int, count: int, height: int, width: int) -> np.ndarray:
-    """Return images (S, H, W, 3) of a camera that moves over noise of three grains."""
+def noise_images(seed: int, count: int, height: int, width: int) -> np.ndarray:
+    """Return images (S, H, W, 3) of a camera that moves over noise of three scales."""
     rng = np.random.Generator(np.random.PCG64(seed))
     rows, columns = height + 32, width + 8 * count + 32
     canvas = np.zeros((rows, columns, 3), dtype=np.int64)
@@ -117,11 +116,11 @@ def images_of(seed: int, count: int, height: int, width: int) -> np.ndarray:
 
 
 @cache
-def frames_seen(count: int, seed: int = 0, height: int = 60, width: int = 80
+def noise_frames(count: int, seed: int = 0, height: int = 60, width: int = 80
                 ) -> tuple[Frame, ...]:
-    """Return frames of no known camera; the same objects at every call."""
+    """Return frames without a camera; the same objects at every call."""
     return tuple(Frame(1 + 50_000_000 * index, image, None)
-                 for index, image in enumerate(images_of(seed, count, height, width)))
+                 for index, image in enumerate(noise_images(seed, count, height, width)))
 
 
 def to_tensor(images: np.ndarray) -> Tensor:
@@ -129,23 +128,23 @@ def to_tensor(images: np.ndarray) -> Tensor:
     return torch.tensor(images).permute(0, 3, 1, 2).float() / 255.0
 
 
-def window_of(backbone: VggtBackbone, frames: Sequence[Frame]) -> Window:
+def make_window(backbone: VggtBackbone, frames: Sequence[Frame]) -> Window:
     """Return the window of these frames in a new stream."""
     stream = backbone.open(None)
     return Window(stream, tuple(stream.encode(frame) for frame in frames))
 
 
 @contextmanager
-def listening(**modules: nn.Module) -> Iterator[dict[str, list[tuple[Tensor, Tensor]]]]:
-    """Give what goes into and comes out of some modules, by name, in order."""
-    heard: dict[str, list[tuple[Tensor, Tensor]]] = {name: [] for name in modules}
+def record_calls(**modules: nn.Module) -> Iterator[dict[str, list[tuple[Tensor, Tensor]]]]:
+    """Yield a list per name that records (first input, output) of each call of the module."""
+    calls: dict[str, list[tuple[Tensor, Tensor]]] = {name: [] for name in modules}
 
-    def listener(name: str) -> Any:
-        return lambda module, given, came: heard[name].append((given[0], came))
+    def recorder(name: str) -> Any:
+        return lambda module, inputs, output: calls[name].append((inputs[0], output))
 
-    hooks = [module.register_forward_hook(listener(name)) for name, module in modules.items()]
+    hooks = [module.register_forward_hook(recorder(name)) for name, module in modules.items()]
     try:
-        yield heard
+        yield calls
     finally:
         for hook in hooks:
             hook.remove()

@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What each method did on the sequences of one dataset: the lines of a table in the making."""
+"""Aggregation of rows: values by method, column and seed; medians and averages of them."""
 
 from __future__ import annotations
 
@@ -10,49 +10,38 @@ from dataclasses import dataclass
 import numpy as np
 
 from kfvo_ros.evaluation.records import FINISHED, TRIVIAL, Row
-from kfvo_ros.evaluation.render import number
 
 Seed = int | None
 
 
 @dataclass(frozen=True)
 class Spread:
-    """The median of what the seeds gave, the smallest and the largest."""
+    """Median, minimum and maximum over the seeds."""
 
     median: float
-    least: float
-    most: float
+    minimum: float
+    maximum: float
 
     @classmethod
     def of(cls, values: Iterable[float]) -> Spread | None:
-        """Return that of any values, None of none."""
+        """Return the spread of values, None without values."""
         values = tuple(values)
         return cls(float(np.median(values)), min(values), max(values)) if values else None
-
-    def text(self, decimals: int) -> str:
-        """Return median, and where they print as different numbers, smallest and largest."""
-        least, most = number(self.least, decimals), number(self.most, decimals)
-        return number(self.median, decimals) + (f' ({least}–{most})' if least != most else '')
 
 
 @dataclass(frozen=True)
 class MethodResults:
-    """One method: ``values`` by column and seed."""
+    """The results of one method on one dataset: ``values`` by column and seed."""
 
     method: str
     values: dict[str, dict[Seed, float]]
 
-    @property
-    def looks(self) -> bool:
-        """Whether it is one to compare."""
-        return self.method not in TRIVIAL
-
     def spread(self, column: str) -> Spread | None:
-        """Return that of a column, None where there is nothing."""
+        """Return the spread over the seeds of a column, None without values."""
         return Spread.of(self.values.get(column, {}).values())
 
     def average(self, columns: Sequence[str]) -> Spread | None:
-        """Return the mean over columns of each seed that has them all; their spread."""
+        """Return the spread of the seeds' means over `columns`, of seeds that have them all."""
         if not columns:
             return None
         seeds = set.intersection(*(set(self.values.get(column, {})) for column in columns))
@@ -61,12 +50,12 @@ class MethodResults:
 
 
 def label_of(method: str) -> str:
-    """Return what tables call a method."""
+    """Return the label of a method in tables."""
     return method.replace('_', ' ') if method in TRIVIAL else method
 
 
 def methods_of(rows: Iterable[Row]) -> tuple[str, ...]:
-    """Return the methods as they come, those that never look last."""
+    """Return the methods in order of appearance, trivial baselines last."""
     return tuple(sorted(dict.fromkeys(row.method for row in rows), key=TRIVIAL.__contains__))
 
 
@@ -75,21 +64,39 @@ def columns_of(rows: Iterable[Row]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(str(row.column) for row in rows))
 
 
-def collect_results(rows: Iterable[Row], methods: Iterable[str], name: str) -> list[MethodResults]:
-    """Return a line for each method, of the values in column `name` of results.csv.
-
-    Those of failed runs are left out: they are of another part of the sequence.
-    """
-    lines = {method: MethodResults(method, {}) for method in methods}
+def group_by_dataset(rows: Iterable[Row]) -> dict[str, list[Row]]:
+    """Return the rows of each dataset."""
+    groups: dict[str, list[Row]] = {}
     for row in rows:
-        value = getattr(row, name)
+        groups.setdefault(str(row.dataset), []).append(row)
+    return groups
+
+
+def collect_results(rows: Iterable[Row], methods: Iterable[str], field: str
+                    ) -> list[MethodResults]:
+    """Return the results of each method: the values of a `field` of `Row`.
+
+    Failed runs are left out: their errors are of a part of the sequence.
+    """
+    results = {method: MethodResults(method, {}) for method in methods}
+    for row in rows:
+        value = getattr(row, field)
         if row.status == FINISHED and value is not None:
-            lines[row.method].values.setdefault(str(row.column), {})[row.seed] = value
-    return list(lines.values())
+            results[row.method].values.setdefault(str(row.column), {})[row.seed] = value
+    return list(results.values())
 
 
-def common_columns(lines: Iterable[MethodResults], columns: Iterable[str]) -> tuple[str, ...]:
-    """Return the columns that every line has which has any: averages are over these."""
-    present = [line for line in lines if line.values]
+def common_columns(results: Iterable[MethodResults], columns: Iterable[str]) -> tuple[str, ...]:
+    """Return the columns that all methods have, those without any values aside.
+
+    Averages are over these.
+    """
+    present = [each for each in results if each.values]
     return tuple(column for column in columns
-                 if present and all(column in line.values for line in present))
+                 if present and all(column in each.values for each in present))
+
+
+def median_of(rows: Iterable[Row], field: str) -> float | None:
+    """Return the median of a `field` of `Row`, None where no row has it."""
+    present = [value for value in (getattr(row, field) for row in rows) if value is not None]
+    return float(np.median(present)) if present else None

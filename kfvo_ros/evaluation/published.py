@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the paper reports, to stand beside what was measured here."""
+"""Numbers of the paper's tables, for comparison with those measured here."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FILE = Path(__file__).with_name('published.yaml')
 
 @dataclass(frozen=True)
 class PublishedRow:
-    """A method's ATE [m] on the sequences of a dataset, and the average that is printed."""
+    """A method's ATE [m] on the sequences of a dataset, and its average as printed."""
 
     method: str
     keyframes: bool
@@ -37,7 +37,7 @@ class PublishedTable:
 
 @dataclass(frozen=True)
 class PublishedAverage:
-    """The average ATE [m] of a method by dataset; ``ours`` is our name of it, where it has one."""
+    """The average ATE [m] of a method by dataset; ``ours`` is its name here, None without one."""
 
     method: str
     averages: dict[str, float]
@@ -46,7 +46,7 @@ class PublishedAverage:
 
 @dataclass(frozen=True)
 class Published:
-    """All tables: ATE by dataset, keyframe strategies, milliseconds by part, the ablation."""
+    """All tables: ATE by dataset, keyframe strategies, the ablation, milliseconds by step."""
 
     ate: dict[str, PublishedTable]
     strategies: tuple[PublishedAverage, ...]
@@ -55,21 +55,21 @@ class Published:
     caveats: tuple[str, ...]
 
     def has_all(self, dataset: str, columns: Iterable[str]) -> bool:
-        """Whether the paper has these sequences: an average over others is another thing."""
+        """Return whether the paper has all these sequences, so that averages are comparable."""
         return dataset in self.ate and set(columns) <= set(self.ate[dataset].sequences)
 
 
 @cache
 def published() -> Published:
-    """Return what the file beside this one holds."""
-    told = yaml.safe_load(FILE.read_text('utf-8'))
+    """Return the content of published.yaml."""
+    content = yaml.safe_load(FILE.read_text('utf-8'))
     return Published(
-        {dataset: _table(table) for dataset, table in told['ate'].items()},
-        tuple(PublishedAverage(**each) for each in told['strategies']),
-        tuple(PublishedAverage(**each) for each in told['ablation']),
-        told['runtime'], tuple(told['caveats']))
+        {dataset: _table(table) for dataset, table in content['ate'].items()},
+        tuple(PublishedAverage(**each) for each in content['strategies']),
+        tuple(PublishedAverage(**each) for each in content['ablation']),
+        content['runtime'], tuple(content['caveats']))
 
 
-def _table(told: dict[str, Any]) -> PublishedTable:
-    rows = (PublishedRow(**row | {'errors': tuple(row['errors'])}) for row in told['rows'])
-    return PublishedTable(told['decimals'], tuple(told['sequences']), tuple(rows))
+def _table(content: dict[str, Any]) -> PublishedTable:
+    rows = (PublishedRow(**row | {'errors': tuple(row['errors'])}) for row in content['rows'])
+    return PublishedTable(content['decimals'], tuple(content['sequences']), tuple(rows))

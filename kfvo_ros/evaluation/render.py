@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Tables before anybody decides whether they become Markdown, LaTeX or HTML."""
+"""Tables, and their rendering as Markdown, LaTeX and HTML."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from kfvo_ros.utils.files import atomic_write
 
 Mark = Literal['best', 'second']
 YES, NO, NONE = '✓', '✗', '–'
-MARKDOWN_FORMS = {'best': '**{}**', 'second': '<u>{}</u>', None: '{}'}
-SPECIAL = re.compile(r'([\\`*<>|])')
+MARKDOWN_MARKS = {'best': '**{}**', 'second': '<u>{}</u>', None: '{}'}
+MARKDOWN_SPECIAL = re.compile(r'([\\`*<>|])')
 LATEX_HEAD = r"""% \input this file; it needs \usepackage{booktabs,graphicx,pifont,xcolor}
 """
-LATEX_FORMS = {'best': r'\colorbox{{red!50}}{{{}}}', 'second': r'\colorbox{{orange!50}}{{{}}}',
+LATEX_MARKS = {'best': r'\colorbox{{red!50}}{{{}}}', 'second': r'\colorbox{{orange!50}}{{{}}}',
                None: '{}'}
-SIGNS = {'\\': r'\textbackslash{}', '&': r'\&', '%': r'\%', '$': r'\$', '#': r'\#', '_': r'\_',
-         '{': r'\{', '}': r'\}', '~': r'\textasciitilde{}', '^': r'\textasciicircum{}',
-         '[': '{[}', ']': '{]}', '<': r'\textless{}', '>': r'\textgreater{}', '–': '--',
-         '†': r'$\dagger$', YES: r'\textcolor{green}{\ding{51}}',
-         NO: r'\textcolor{red}{\ding{55}}'}
-FITTED = r'\resizebox{\ifdim\width>\textwidth\textwidth\else\width\fi}{!}{%'
-"""As wide as it is, but no wider than the page."""
-STYLE = """\
+LATEX_ESCAPES = {
+    '\\': r'\textbackslash{}', '&': r'\&', '%': r'\%', '$': r'\$', '#': r'\#', '_': r'\_',
+    '{': r'\{', '}': r'\}', '~': r'\textasciitilde{}', '^': r'\textasciicircum{}', '[': '{[}',
+    ']': '{]}', '<': r'\textless{}', '>': r'\textgreater{}', '–': '--', '†': r'$\dagger$',
+    YES: r'\textcolor{green}{\ding{51}}', NO: r'\textcolor{red}{\ding{55}}'}
+LATEX_RESIZEBOX = r'\resizebox{\ifdim\width>\textwidth\textwidth\else\width\fi}{!}{%'
+"""Natural width, but at most the width of the page."""
+HTML_STYLE = """\
 :root { color-scheme: light dark; --ink: #1b1b1b; --paper: #ffffff; --line: #d0d0d0;
         --quiet: #5a5a5a; --best: #ffc9c4; --second: #ffe3bd; }
 @media (prefers-color-scheme: dark) {
@@ -67,12 +67,12 @@ HTML_HEAD = """\
 <h1>{title}</h1>
 <p class="key"><span class="best">best</span> <span class="second">second best</span></p>
 """
-TAIL = '</body>\n</html>\n'
+HTML_TAIL = '</body>\n</html>\n'
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One plain text, and whether it is the best or second best of its column."""
+    """A plain text, and its mark if it is the best or second best of its column."""
 
     text: str
     mark: Mark | None = None
@@ -80,9 +80,9 @@ class Cell:
 
 @dataclass(frozen=True)
 class Table:
-    """``head`` (columns), ``rows`` of as many cells, and ``notes`` to print below.
+    """``head`` (columns), ``rows`` of as many cells, and ``notes`` below the table.
 
-    The first ``words`` columns hold words, the others numbers, of which the last sums up the
+    The first ``words`` columns hold words, the others numbers, the last of them a summary of the
     others if ``total``; ``rules`` are the rows above which a line is drawn.
     """
 
@@ -95,50 +95,27 @@ class Table:
     rules: tuple[int, ...] = ()
 
 
-def number(value: float | None, decimals: int) -> str:
-    """Return the number, or a dash for none."""
-    return NONE if value is None else f'{value:.{decimals}f}'
-
-
-def marks(values: Sequence[float | None], decimals: int) -> list[Mark | None]:
-    """Return the marks of a column in which less is better; what prints alike ranks alike.
-
-    Where there is nothing to compare, nothing is marked.
-    """
-    printed = [None if value is None else round(value, decimals) for value in values]
-    ranks = sorted({value for value in printed if value is not None})
-    if len(values) - printed.count(None) < 2:
-        return [None] * len(values)
-    best, second = (*ranks, None)[:2]
-    return [None if value is None else 'best' if value == best
-            else 'second' if value == second else None for value in printed]
-
-
-def rules_between(*ends: int) -> tuple[int, ...]:
-    """Return the rules between groups of rows that end there, the last with the table."""
-    return tuple(sorted({end for end in ends[:-1] if 0 < end < ends[-1]}))
-
-
 def markdown(table: Table) -> str:
-    """Return the table under a heading, its notes below."""
+    """Return a table in Markdown, under a heading and with its notes below."""
     return '\n'.join((f'## {escape_markdown(table.title)}', '', *_markdown_grid(table), '',
                       *(f'{escape_markdown(note)}  ' for note in table.notes), ''))
 
 
 def escape_markdown(text: str) -> str:
-    """Return what Markdown shows as this text."""
-    return SPECIAL.sub(r'\\\1', text)
+    """Return the Markdown of a plain text."""
+    return MARKDOWN_SPECIAL.sub(r'\\\1', text)
 
 
 def _markdown_grid(table: Table) -> Iterator[str]:
     yield _markdown_row(map(escape_markdown, table.head))
-    yield _markdown_row('---' if index < table.words else '---:' for index in range(len(table.head)))
+    yield _markdown_row('---' if index < table.words else '---:'
+                        for index in range(len(table.head)))
     for row in table.rows:
         yield _markdown_row(map(_markdown_cell, row))
 
 
 def _markdown_cell(cell: Cell) -> str:
-    return MARKDOWN_FORMS[cell.mark].format(escape_markdown(cell.text))
+    return MARKDOWN_MARKS[cell.mark].format(escape_markdown(cell.text))
 
 
 def _markdown_row(texts: Iterator[str]) -> str:
@@ -151,15 +128,15 @@ def latex(tables: Iterable[Table]) -> str:
 
 
 def escape_latex(text: str) -> str:
-    """Return what LaTeX prints as this text."""
-    return ''.join(SIGNS.get(sign, sign) for sign in text)
+    """Return the LaTeX of a plain text."""
+    return ''.join(LATEX_ESCAPES.get(sign, sign) for sign in text)
 
 
 def _float(table: Table) -> Iterator[str]:
     yield r'\begin{table*}[t]'
     yield r'\centering'
     yield rf'\caption{{{escape_latex(table.title)}.}}'
-    yield FITTED
+    yield LATEX_RESIZEBOX
     yield rf'\begin{{tabular}}{{{_columns(table)}}}'
     yield r'\toprule'
     yield _latex_row(rf'\textbf{{{escape_latex(name)}}}' for name in table.head)
@@ -176,29 +153,29 @@ def _float(table: Table) -> Iterator[str]:
 
 
 def _columns(table: Table) -> str:
-    """Return the columns' alignment, with lines between kinds of columns."""
+    """Return the alignment of the columns, with lines between kinds of columns."""
     numbers = len(table.head) - table.words - table.total
     return '|'.join(filter(None, ('l', 'c' * (table.words - 1), 'c' * numbers,
                                   'c' * table.total)))
 
 
 def _latex_cell(cell: Cell) -> str:
-    return LATEX_FORMS[cell.mark].format(escape_latex(cell.text))
+    return LATEX_MARKS[cell.mark].format(escape_latex(cell.text))
 
 
 def _latex_row(texts: Iterable[str]) -> str:
     return ' & '.join(texts) + r' \\'
 
 
-def write_page(path: Path, title: str, tables: Sequence[Table], pictures: Sequence[Path]) -> None:
-    """Write tables and pictures (PNG) into one page; replaces an earlier one."""
+def write_page(path: Path, title: str, tables: Sequence[Table], figures: Sequence[Path]) -> None:
+    """Write tables and figures (PNG) into one HTML page, in place of an earlier one."""
     with atomic_write(path) as draft, draft.open('w', encoding='utf-8') as file:
-        file.write(HTML_HEAD.format(title=escape(title), style=STYLE))
+        file.write(HTML_HEAD.format(title=escape(title), style=HTML_STYLE))
         for table in tables:
             file.writelines(_html_table(table))
-        for picture in pictures:
-            file.writelines(_picture(picture))
-        file.write(TAIL)
+        for figure in figures:
+            file.writelines(_html_figure(figure))
+        file.write(HTML_TAIL)
 
 
 def _html_table(table: Table) -> Iterator[str]:
@@ -221,8 +198,8 @@ def _html_cell(cell: Cell) -> str:
     return f'<td{mark}>{escape(cell.text)}</td>'
 
 
-def _picture(path: Path) -> Iterator[str]:
-    """Yield the HTML of a picture, with the picture in it."""
+def _html_figure(path: Path) -> Iterator[str]:
+    """Yield the HTML of a figure (PNG), with its data embedded."""
     name = escape(path.stem)
     data = b64encode(path.read_bytes()).decode('ascii')
     yield (f'<figure><figcaption>{name}</figcaption>\n<div class="wide">'

@@ -3,6 +3,6 @@
 """Keyframe policies: which frames stay in the window."""
 
 HEURISTICS = ('every', 'optical_flow', 'survival')
-"""Names of the policies by rule."""
-POLICIES = (*HEURISTICS, 'learned')
-"""Names of the policies, as options and results have them."""
+"""Rules that the benchmark compares by default."""
+POLICIES = (*HEURISTICS, 'parallax', 'learned')
+"""Names of all policies, as in options and results."""

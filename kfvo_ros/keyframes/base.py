@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a keyframe policy sees and answers."""
+"""Interface of keyframe policies, and the observation that learned policies see."""
 
 from __future__ import annotations
 
@@ -14,17 +14,20 @@ from kfvo_ros import geometry
 from kfvo_ros.tracking.tracker import Tracks
 
 POSE_SIZE = 7
+"""Numbers of a pose (t, quat_xyzw)."""
+MIN_TRACKS = 8
+"""With fewer tracks since the last keyframe their mean flow is not reliable: keep the frame."""
 ObservationLayout = tuple[tuple[str, int], ...]
-"""Names of the parts of an observation and how many numbers each has, in order."""
+"""Names and sizes of the parts of an observation, in order."""
 
 
 @dataclass(frozen=True)
 class DecisionInput:
-    """The state of the window when the newest frame is to be kept or dropped.
+    """State of the window at a decision.
 
-    ``observation`` as `keyframes.observation` builds it; ``keyframe_tracks`` and
-    ``newest_tracks`` those of the last keyframe and the newest frame (empty when neither
-    backbone nor policy tracks); ``gap`` counts the input frames between the two.
+    ``observation`` (D,) float32 is that of `observe`. ``keyframe_tracks`` and ``newest_tracks``
+    are those of the last keyframe and the newest frame, empty when neither backbone nor policy
+    tracks. ``gap`` is the number of input frames from the last keyframe to the newest frame.
     """
 
     observation: np.ndarray
@@ -34,7 +37,7 @@ class DecisionInput:
 
 
 class KeyframePolicy(ABC):
-    """Decides, after each frame, whether it stays in the window."""
+    """Decides after each frame whether it stays in the window."""
 
     name: str
     needs_tracks: bool = False
@@ -46,11 +49,11 @@ class KeyframePolicy(ABC):
 
 def observe(descriptors: Sequence[np.ndarray], T_w_frame: np.ndarray,
             signals: np.ndarray) -> np.ndarray:
-    """Return the observation as float32: descriptor, relative poses, signals; not normalised.
+    """Return the observation (D + 7 (S - 1) + len(signals),) float32, not normalised.
 
-    `descriptors` of the window's S frames (D,) are averaged; `T_w_frame` (S, 4, 4), in
-    trajectory units, become T_newest_keyframe, oldest first, as (t, quat_xyzw);
-    the backbone's `signals` follow in their declared order: D + 7 (S - 1) + len(signals).
+    It holds the mean of the `descriptors` (D,) of the window's S frames, the poses
+    T_newest_keyframe, oldest first, as (t, quat_xyzw), and the backbone's `signals`. `T_w_frame`
+    (S, 4, 4) is in trajectory units. Source: the paper, section IV-B.
     """
     T_newest_keyframe = geometry.relative(T_w_frame[-1], T_w_frame[:-1])
     quat_xyzw = geometry.quat_xyzw_from_rotation(T_newest_keyframe[:, :3, :3])
@@ -59,17 +62,18 @@ def observe(descriptors: Sequence[np.ndarray], T_w_frame: np.ndarray,
                            signals]).astype(np.float32)
 
 
-def layout_of(descriptor_size: int, window_size: int, signal_names: Sequence[str]) -> ObservationLayout:
-    """Return the parts of what `observe` returns."""
+def layout_of(descriptor_size: int, window_size: int,
+              signal_names: Sequence[str]) -> ObservationLayout:
+    """Return the layout of what `observe` returns."""
     return (('descriptor', descriptor_size), ('poses', POSE_SIZE * (window_size - 1)),
             *((name, 1) for name in signal_names))
 
 
 def indices_of(parts: ObservationLayout, layout: ObservationLayout) -> np.ndarray:
-    """Return where the numbers of `parts` are in observations of `layout`.
+    """Return the indices of `parts` in observations of `layout`, in the order of `parts`.
 
-    Raises KeyError naming a part that is not in there, in this size.
+    Raises KeyError for a part that the layout does not hold in this size.
     """
     ends = np.cumsum([size for _, size in layout])
-    places = {part: np.arange(end - part[1], end) for part, end in zip(layout, ends)}
-    return np.concatenate([places[part] for part in parts])
+    indices = {part: np.arange(end - part[1], end) for part, end in zip(layout, ends)}
+    return np.concatenate([indices[part] for part in parts])

@@ -1,26 +1,24 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Decisions that are no decisions: what every keyframe policy would do at the extremes."""
+"""Forced decisions at the extremes, before a policy is asked."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from kfvo_ros.keyframes.base import DecisionInput
-from kfvo_ros.keyframes.heuristics import MIN_TRACKS
-from kfvo_ros.tracking.tracker import common, mean_flow
+from kfvo_ros.keyframes.base import MIN_TRACKS, DecisionInput
+from kfvo_ros.tracking.tracker import common_pixels, mean_flow
 
 
 @dataclass(frozen=True)
 class KeyframeGuard:
-    """Keeps a frame when the last keyframe is nearly out of sight, drops one at rest.
+    """Keeps a frame before the tracks of the last keyframe are lost; drops frames at standstill.
 
-    `min_survival`, the share of the last keyframe's tracks that must be left, and `max_gap`,
-    the input frames since then, force to keep; less than `min_flow` [px] of mean motion since
-    then forces to drop, and too few tracks to tell the motion to keep; zero, or None for the
-    gap, forces nothing. Without tracks only the gap counts. It is part of a learned policy: one
-    that was trained inside it knows nothing of what is outside. Raises ValueError for values out
-    of range.
+    In this order: a gap of ``max_gap`` input frames keeps, None for no limit; a share of the last
+    keyframe's tracks below ``min_survival``, or fewer than MIN_TRACKS of them, keeps; mean flow
+    since the last keyframe below ``min_flow`` [px] drops. Zero in both disables the tests of the
+    tracks; without tracks only the gap counts. A learned policy is trained and used inside the
+    same guard. Raises ValueError for values out of range.
     """
 
     min_survival: float = 0.5
@@ -35,23 +33,24 @@ class KeyframeGuard:
 
     @property
     def needs_tracks(self) -> bool:
-        """Whether it asks how far the tracks moved, or how many are left."""
+        """Whether survival or flow is tested."""
         return self.min_survival > 0.0 or self.min_flow > 0.0
 
     def without_tracks(self) -> KeyframeGuard:
-        """Return what is left of it where nothing is tracked."""
+        """Return the guard for a backbone without tracks, which tests the gap only."""
         return replace(self, min_survival=0.0, min_flow=0.0)
 
     def forced(self, decision: DecisionInput) -> bool | None:
-        """Return the decision where there is only one, else None."""
+        """Return the forced decision, None where the policy decides."""
         if self.max_gap is not None and decision.gap >= self.max_gap:
             return True
         if not self.needs_tracks or len(decision.keyframe_tracks) == 0:
             return None
-        before, after = common(decision.keyframe_tracks, decision.newest_tracks)
+        before, after = common_pixels(decision.keyframe_tracks, decision.newest_tracks)
         if len(before) < max(MIN_TRACKS, self.min_survival * len(decision.keyframe_tracks)):
             return True
         return False if mean_flow(before, after) < self.min_flow else None
 
 
 NO_GUARD = KeyframeGuard(min_survival=0.0, max_gap=None, min_flow=0.0)
+"""Forces nothing."""

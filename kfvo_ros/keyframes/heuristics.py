@@ -8,26 +8,32 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kfvo_ros.keyframes.base import DecisionInput, KeyframePolicy, ObservationLayout, indices_of
-from kfvo_ros.tracking.tracker import common, mean_flow
+from kfvo_ros.keyframes.base import (
+    MIN_TRACKS,
+    DecisionInput,
+    KeyframePolicy,
+    ObservationLayout,
+    indices_of,
+)
+from kfvo_ros.keyframes.guard import KeyframeGuard
+from kfvo_ros.tracking.tracker import common_pixels, mean_flow
 
-MIN_TRACKS = 8
-"""With fewer tracks left since the last keyframe their mean motion means nothing: keep."""
 FLOW, BASELINE, SURVIVAL = 'flow', 'baseline_to_depth', 'track_survival'
+"""Signals of the backbone that the parallax rule compares."""
 
 
 class EveryFrame(KeyframePolicy):
-    """Keep every frame: the paper's VGGT-SW."""
+    """Keeps every frame: the paper's VGGT-SW."""
 
     name = 'every'
 
     def decide(self, decision: DecisionInput) -> bool:
-        """Keep."""
+        """Return True."""
         return True
 
 
 class OpticalFlow(KeyframePolicy):
-    """Keep once the tracks moved by more than `threshold` [px] on average: VGGT-LK."""
+    """Keeps when the mean flow since the last keyframe exceeds `threshold` [px]: VGGT-LK."""
 
     name = 'optical_flow'
     needs_tracks = True
@@ -36,15 +42,15 @@ class OpticalFlow(KeyframePolicy):
         self.threshold = threshold
 
     def decide(self, decision: DecisionInput) -> bool:
-        """Compare the mean flow since the last keyframe with the threshold."""
-        before, after = common(decision.keyframe_tracks, decision.newest_tracks)
+        """Compare the mean flow with the threshold; keep when too few tracks are left."""
+        before, after = common_pixels(decision.keyframe_tracks, decision.newest_tracks)
         return len(before) < MIN_TRACKS or mean_flow(before, after) > self.threshold
 
 
 class Survival(KeyframePolicy):
-    """Keep once less than `share` of the last keyframe's tracks survive.
+    """Keeps when less than `share` of the last keyframe's tracks survive.
 
-    Never below `min_flow` [px] of mean flow, so that a camera at rest adds no keyframes.
+    Below `min_flow` [px] of mean flow it drops, so that a camera at rest adds no keyframes.
     """
 
     name = 'survival'
@@ -55,20 +61,20 @@ class Survival(KeyframePolicy):
         self.min_flow = min_flow
 
     def decide(self, decision: DecisionInput) -> bool:
-        """Compare the share of surviving tracks with the threshold."""
-        before, after = common(decision.keyframe_tracks, decision.newest_tracks)
+        """Compare survival and mean flow with the thresholds; keep when few tracks are left."""
+        before, after = common_pixels(decision.keyframe_tracks, decision.newest_tracks)
         if len(before) < MIN_TRACKS:
             return True
-        survived = len(before) / len(decision.keyframe_tracks)
-        return survived < self.share and mean_flow(before, after) >= self.min_flow
+        survival = len(before) / len(decision.keyframe_tracks)
+        return survival < self.share and mean_flow(before, after) >= self.min_flow
 
 
 @dataclass(frozen=True)
 class ParallaxRule:
-    """Keeps a frame after enough flow or baseline, or when too few of the tracks are left.
+    """Keeps after enough flow or baseline, or when too few tracks survive.
 
-    ``flow`` is the tracks' mean motion since the last keyframe [px], ``baseline`` the camera's by
-    the median depth, ``survival`` the share of that keyframe's tracks which must be left.
+    Since the last keyframe: ``flow`` is the mean flow of the tracks [px], ``baseline`` the camera
+    motion over the median depth, ``survival`` the share of surviving tracks.
     """
 
     flow: float
@@ -76,13 +82,39 @@ class ParallaxRule:
     survival: float
 
     @staticmethod
-    def unseen_in(layout: ObservationLayout) -> list[str]:
-        """Return the names of what a teacher looks at and an observation does not hold."""
+    def missing_signals(layout: ObservationLayout) -> list[str]:
+        """Return the names of the signals that the rule compares and the layout does not hold."""
         return [name for name in (FLOW, BASELINE, SURVIVAL) if (name, 1) not in layout]
 
     def decide(self, observations: np.ndarray, layout: ObservationLayout) -> np.ndarray:
-        """Return 1 where it keeps, else 0, (N,) for observations (N, D) in this layout."""
-        seen = indices_of(((FLOW, 1), (BASELINE, 1), (SURVIVAL, 1)), layout)
-        flow, baseline, survival = observations[:, seen].T
+        """Return 1 to keep, 0 to drop: (N,) int64 for observations (N, D) of this layout."""
+        columns = indices_of(((FLOW, 1), (BASELINE, 1), (SURVIVAL, 1)), layout)
+        flow, baseline, survival = observations[:, columns].T
         return ((flow > np.log1p(self.flow)) | (baseline > self.baseline)
                 | (survival < self.survival)).astype(np.int64)
+
+
+PARALLAX_RULE = ParallaxRule(flow=50.0, baseline=0.02, survival=0.2)
+PARALLAX_GUARD = KeyframeGuard(min_survival=0.15, max_gap=60, min_flow=2.0)
+"""The rule that the learned policy imitates first, and the guard of both: config/train.yaml."""
+
+
+class ParallaxPolicy(KeyframePolicy):
+    """Decides by a `ParallaxRule` inside a `KeyframeGuard`, on observations of `layout`.
+
+    The layout must hold the rule's signals; see `ParallaxRule.missing_signals`.
+    """
+
+    name = 'parallax'
+
+    def __init__(self, layout: ObservationLayout, rule: ParallaxRule = PARALLAX_RULE,
+                 guard: KeyframeGuard = PARALLAX_GUARD) -> None:
+        self._layout, self._rule, self._guard = layout, rule, guard
+        self.needs_tracks = guard.needs_tracks
+
+    def decide(self, decision: DecisionInput) -> bool:
+        """Return the guard's decision if it forces one, else that of the rule."""
+        forced = self._guard.forced(decision)
+        if forced is not None:
+            return forced
+        return bool(self._rule.decide(decision.observation[None], self._layout)[0])

@@ -1,9 +1,10 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""From the camera to the robot's base: poses, velocities and covariances that ROS expects.
+"""Motion of the robot base from that of its camera: poses, twists and covariances for ROS.
 
-With T_base_camera fixed, T_odom_base = T_base_camera T_world_camera T_base_camera^-1: odom is
-where the base was at the first image. A base has the axes of REP-103: x forward, y left, z up.
+T_base_camera is fixed and odom is the base at the first image, as world is the camera there:
+T_odom_base = T_base_camera T_world_camera T_base_camera^-1. The base has the axes of REP-103:
+x forward, y left, z up.
 """
 
 from __future__ import annotations
@@ -18,15 +19,16 @@ from kfvo_ros.trajectory import NANOSECONDS, UNKNOWN_VARIANCE
 
 T_BODY_OPTICAL = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0],
                            [0.0, 0.0, 0.0, 1.0]])
-"""An optical frame (x right, y down, z forward) on a body in its place (REP-103)."""
+"""Rotation of an optical frame (x right, y down, z forward) in body axes (REP-103)."""
 
 
 @dataclass(frozen=True)
 class BaseMotion:
-    """What an Odometry message says of the base at ``stamp_ns``.
+    """Pose and velocity of the base at ``stamp_ns``, the content of an Odometry message.
 
-    ``T_odom_base`` (4, 4) with ``covariance`` (6, 6) in the axes of odom; ``twist`` (6,) linear
-    [m/s] then angular [rad/s] in those of the base, with ``twist_covariance`` (6, 6).
+    ``T_odom_base`` (4, 4) with ``covariance`` (6, 6) in the axes of odom, translation first;
+    ``twist`` (6,) linear [m/s], then angular [rad/s] in the axes of the base, with
+    ``twist_covariance`` (6, 6).
     """
 
     stamp_ns: int
@@ -37,31 +39,32 @@ class BaseMotion:
 
 
 def base_pose(T_world_camera: np.ndarray, T_base_camera: np.ndarray) -> np.ndarray:
-    """Return T_odom_base (4, 4)."""
+    """Return T_odom_base (4, 4) for a camera pose T_world_camera (4, 4)."""
     return T_base_camera @ T_world_camera @ geometry.invert(T_base_camera)
 
 
 def base_motion(pose: OnlinePose, T_base_camera: np.ndarray) -> BaseMotion:
-    """Return what `pose`, of the camera, means for the base that carries it."""
+    """Return the motion of the base for a pose of the camera; no twist without a motion."""
     T_odom_base = base_pose(pose.T_world_camera, T_base_camera)
-    moved = _adjoint(T_base_camera, T_odom_base)
-    covariance = moved @ pose.covariance @ moved.T
+    adjoint = _adjoint(T_base_camera, T_odom_base)
+    covariance = adjoint @ pose.covariance @ adjoint.T
     twist, twist_covariance = np.zeros(6), UNKNOWN_VARIANCE * np.eye(6)
-    if pose.T_before_camera is not None:
+    if pose.T_previous_camera is not None:
         seconds = pose.interval_ns / NANOSECONDS
-        T_before_base = base_pose(pose.T_before_camera, T_base_camera)
-        turn = T_before_base[:3, :3]
-        twist = np.concatenate([turn.T @ T_before_base[:3, 3], geometry.log_so3(turn)]) / seconds
-        into_base = np.kron(np.eye(2), T_odom_base[:3, :3].T) @ moved / seconds
-        twist_covariance = into_base @ pose.motion_covariance @ into_base.T
+        T_previous_base = base_pose(pose.T_previous_camera, T_base_camera)
+        R_previous_base = T_previous_base[:3, :3]
+        twist = np.concatenate([R_previous_base.T @ T_previous_base[:3, 3],
+                                geometry.log_so3(R_previous_base)]) / seconds
+        jacobian = np.kron(np.eye(2), T_odom_base[:3, :3].T) @ adjoint / seconds
+        twist_covariance = jacobian @ pose.motion_covariance @ jacobian.T
     return BaseMotion(pose.stamp_ns, T_odom_base, _symmetric(covariance), twist,
                       _symmetric(twist_covariance))
 
 
 def _adjoint(T_base_camera: np.ndarray, T_odom_base: np.ndarray) -> np.ndarray:
-    """Return the matrix (6, 6) from errors of the camera in the world to those of base in odom.
+    """Return the matrix (6, 6) from camera pose errors in world to base pose errors in odom.
 
-    The base is off the camera: where the camera's rotation errs, the base is displaced.
+    A rotation error of the camera displaces the base by the lever arm between them.
     """
     R_odom_world = T_base_camera[:3, :3]
     lever = -T_odom_base[:3, :3] @ T_base_camera[:3, 3]  # from the camera to the base, in odom

@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""From options to working parts."""
+"""Working parts from options: backbone, keyframe policy, odometry, sequence."""
 
 from __future__ import annotations
 
@@ -13,8 +13,14 @@ from kfvo_ros.backbones.base import Backbone
 from kfvo_ros.camera import read_camera_info
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.keyframes.base import KeyframePolicy, layout_of
-from kfvo_ros.keyframes.heuristics import EveryFrame, OpticalFlow, Survival
-from kfvo_ros.keyframes.learned import PolicySignature
+from kfvo_ros.keyframes.heuristics import (
+    EveryFrame,
+    OpticalFlow,
+    ParallaxPolicy,
+    ParallaxRule,
+    Survival,
+)
+from kfvo_ros.keyframes.learned import PolicySignature, find_policy, read_policy
 from kfvo_ros.odometry.keyframe_odometry import KeyframeOdometry
 from kfvo_ros.odometry.options import OdometryOptions, SequenceOptions, VggtOptions
 from kfvo_ros.sequences import open_sequence
@@ -22,7 +28,7 @@ from kfvo_ros.sequences.base import Sequence
 
 
 def make_backbone(options: OdometryOptions, vggt: VggtOptions | None = None) -> Backbone:
-    """Return the backbone that `options` name, ready for its first frame; raises KfvoError."""
+    """Return the backbone of `options`, ready for its first frame; raises KfvoError."""
     if options.backbone == 'vggt':
         from kfvo_ros.backbones.vggt.backbone import load_backbone
         vggt = vggt or VggtOptions()
@@ -34,7 +40,10 @@ def make_backbone(options: OdometryOptions, vggt: VggtOptions | None = None) -> 
 
 
 def make_policy(options: OdometryOptions, backbone: Backbone) -> KeyframePolicy:
-    """Return the keyframe policy that `options` name, for this backbone; raises KfvoError."""
+    """Return the keyframe policy of `options` for this backbone; raises KfvoError.
+
+    Without a choice it is the learned policy if one fits, else `Survival`.
+    """
     if options.policy is not None and options.keyframes not in (None, 'learned'):
         raise KfvoError(f'the policy file {options.policy} is for keyframes learned, came '
                         f'keyframes {options.keyframes}: choose learned, or leave the policy out')
@@ -44,35 +53,52 @@ def make_policy(options: OdometryOptions, backbone: Backbone) -> KeyframePolicy:
         return OpticalFlow(options.flow_threshold)
     if options.keyframes == 'survival':
         return Survival(options.survival_share)
-    from kfvo_ros.keyframes.learned import find_policy, read_policy
-    path, setting = find_policy(options.policy, backbone.name), signature_of(options, backbone)
+    signature = signature_of(options, backbone)
+    if options.keyframes == 'parallax':
+        return _make_parallax_policy(signature)
+    path = find_policy(options.policy, backbone.name)
     file = read_policy(path) if path is not None else None
-    unasked = options.keyframes is None and options.policy is None
-    if unasked and (file is None or file.setting.misfit(setting) is not None):
+    is_default = options.keyframes is None and options.policy is None
+    if is_default and (file is None or file.signature.mismatch(signature) is not None):
         return Survival(options.survival_share)
     if file is None:
         raise KfvoError(f'no learned policy comes with the {backbone.name} backbone: expected the '
                         'file of one in policy, none came')
-    return file.policy(setting)
+    return file.policy(signature)
+
+
+def _make_parallax_policy(signature: PolicySignature) -> ParallaxPolicy:
+    """Return the parallax policy; raises KfvoError for a backbone without its signals."""
+    missing = ParallaxRule.missing_signals(signature.observation)
+    if missing:
+        raise KfvoError('keyframes parallax: expected a backbone with the signals '
+                        f'{" and ".join(missing)}, which {signature.backbone} does not offer; '
+                        'choose another keyframe policy')
+    return ParallaxPolicy(signature.observation)
 
 
 def signature_of(options: OdometryOptions, backbone: Backbone) -> PolicySignature:
-    """Return what a learned policy must fit."""
+    """Return the signature that a learned policy must match."""
     return PolicySignature(backbone.name, options.scale_rule or backbone.default_scale_rule,
                            options.window_size,
                            layout_of(backbone.descriptor_size, options.window_size,
                                      backbone.signal_names))
 
 
-def make_odometry(options: OdometryOptions, backbone: Backbone | None = None) -> KeyframeOdometry:
-    """Return the odometry that `options` describe, with a backbone that is there already."""
-    backbone = backbone or make_backbone(options)
+def make_odometry(options: OdometryOptions | None = None, backbone: Backbone | None = None,
+                  vggt: VggtOptions | None = None) -> KeyframeOdometry:
+    """Return the odometry of `options`; None stands for the defaults of each argument.
+
+    A `backbone` that exists already can serve many odometries. Raises KfvoError.
+    """
+    options = options or OdometryOptions()
+    backbone = backbone or make_backbone(options, vggt)
     return KeyframeOdometry(backbone, make_policy(options, backbone), options.scale_rule,
                             options.window_size)
 
 
 def make_sequence(text: str, options: SequenceOptions) -> Sequence:
-    """Open the sequence; raises KfvoError."""
+    """Open a sequence as `options` say; raises KfvoError."""
     return open_sequence(
         text, kind=options.kind, image_topic=options.image_topic,
         camera=read_camera_info(Path(options.camera)) if options.camera else None,

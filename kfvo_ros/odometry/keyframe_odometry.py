@@ -1,11 +1,15 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Keyframe-based feed-forward visual odometry: the method, one step after the other."""
+"""Keyframe-based feed-forward visual odometry: the method of the paper, step by step.
+
+Each frame is encoded once (1), the backbone estimates the poses of its window relative to the
+oldest keyframe, the anchor (2), their scale is aligned to the trajectory (3), they are chained to
+the world (4), the window is observed (5), and the keyframe policy keeps or drops the frame (6).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import replace
 
 import numpy as np
 
@@ -14,7 +18,6 @@ from kfvo_ros.backbones.base import (
     Backbone,
     Encoded,
     Estimate,
-    Points,
     Status,
     Stream,
     Window,
@@ -24,6 +27,7 @@ from kfvo_ros.camera import Camera
 from kfvo_ros.images import to_grey
 from kfvo_ros.keyframes.base import DecisionInput, KeyframePolicy, observe
 from kfvo_ros.odometry.scale import ScaleAligner
+from kfvo_ros.odometry.updates import FramePose, Keyframe, Step, Update
 from kfvo_ros.odometry.window_prior import (
     WindowState,
     propagate_covariance,
@@ -37,83 +41,18 @@ from kfvo_ros.utils.process import Stopwatch
 
 WINDOW_SIZE = 8
 MAX_LOST_FRAMES = 5
-"""After so many lost frames in a row the window starts anew where the camera was last seen."""
+"""After this many lost frames in a row the window restarts at the last known pose."""
 MAX_PENDING = 1000
-"""A camera at rest adds no keyframes: when more frames wait, the oldest are final as they are."""
-
-
-@dataclass
-class Keyframe:
-    """A frame in the window; its pose T_world_camera is overwritten by every window it is in.
-
-    ``covariance`` (6, 6) is the pose's in the world, translation first.
-    """
-
-    encoded: Encoded
-    tracks: Tracks
-    index: int
-    T_world_camera: np.ndarray
-    covariance: np.ndarray
-
-
-@dataclass(frozen=True)
-class FramePose:
-    """An input frame: where it is, told from the keyframe it hangs on.
-
-    The pose follows the keyframe's refinement and is final when the keyframe leaves the window.
-    """
-
-    stamp_ns: int
-    keyframe: Keyframe
-    T_keyframe_camera: np.ndarray
-    is_keyframe: bool
-
-    @property
-    def T_world_camera(self) -> np.ndarray:
-        """Return the latest pose (4, 4) in trajectory units."""
-        return self.keyframe.T_world_camera @ self.T_keyframe_camera
-
-
-@dataclass(frozen=True)
-class Update:
-    """What one input frame changed.
-
-    ``T_world_camera`` (4, 4) is the estimate at arrival, ``covariance`` (6, 6) its covariance
-    in the world, translation first, and ``window_covariance`` the part that arose in this
-    window; ``final`` are the frames whose poses became final, in input order, to be read at
-    once: of a camera at rest they are let go while their keyframe is still in the window;
-    ``points`` of the window in the world, None without;
-    ``durations`` [s] of the steps encode, estimate, decide; ``intrinsics`` K (3, 3) [px] where
-    the backbone estimates them; ``parts`` [s] of these steps, where it tells them.
-    """
-
-    stamp_ns: int
-    T_world_camera: np.ndarray
-    covariance: np.ndarray
-    window_covariance: np.ndarray
-    status: Status
-    is_keyframe: bool
-    final: tuple[FramePose, ...]
-    points: Points | None
-    durations: dict[str, float]
-    intrinsics: np.ndarray | None = None
-    parts: Mapping[str, float] = field(default_factory=dict)
-
-    @property
-    def median_depth(self) -> float | None:
-        """Return how far away the points are [trajectory units], None without."""
-        if self.points is None or not len(self.points.ids):
-            return None
-        return float(np.median(np.linalg.norm(
-            self.points.positions - self.T_world_camera[:3, 3], axis=1)))
+"""Poses that may wait for their keyframe; a camera at rest adds none, so older ones are final."""
 
 
 class KeyframeOdometry:
-    """Feed frames in order, get poses: `process` is the method, `finish` ends the sequence.
+    """Monocular odometry over a sliding window of keyframes: `process` is the method.
 
-    `scale_rule` None takes the backbone's own; without `with_covariance` all covariances stay
-    zero. A caller that batches many sequences into one backbone call runs the steps of `process`
-    itself: `begin`, `integrate`, `commit`.
+    Feed the frames of one sequence in order; `finish` ends it. `scale_rule` None takes the
+    backbone's default; without `with_covariance` all covariances are zero. A caller that batches
+    the windows of many sequences runs the steps of `process` itself: `encode`, `integrate`,
+    `commit`.
     """
 
     def __init__(self, backbone: Backbone, policy: KeyframePolicy,
@@ -122,122 +61,83 @@ class KeyframeOdometry:
         self.backbone = backbone
         self.policy = policy
         self.window_size = window_size
-        self._with_covariance = with_covariance
         self.scale = ScaleAligner(scale_rule or backbone.default_scale_rule)
+        self._with_covariance = with_covariance
         self._stream: Stream | None = None
         self._tracker: Tracker | None = None
         self._keyframes: list[Keyframe] = []
         self._newest: Keyframe
+        self._prior: WindowPrior | None = None
+        self._state = WindowState()
+        self._step = Step()
         self._pending: list[FramePose] = []
         self._final: list[FramePose] = []
-        self._known = WindowState()
-        self._previous: WindowPrior | None = None
-        self._status = Status.OK
-        self._covariance = self._window_covariance = np.zeros((6, 6))
-        self._intrinsics: np.ndarray | None = None
-        self._parts: Mapping[str, float] = {}
         self._lost_in_a_row = 0
         self._frames_seen = 0
 
     def process(self, frame: Frame) -> Update:
-        """Take in the next frame and return what it changed."""
+        """Estimate the pose of the next frame and return what it changed."""
         clock = Stopwatch()
         with clock('encode'):
-            window = self.begin(frame)
+            window = self.encode(frame)
         with clock('estimate'):
             estimate = self.backbone.estimate([window])[0] if window is not None else None
-            decision = self.integrate(estimate)
+            step = self.integrate(estimate)
         with clock('decide'):
-            keep = decision if isinstance(decision, bool) else self.policy.decide(decision)
+            keep = step.keep if step.decision is None else self.policy.decide(step.decision)
         return self.commit(keep, clock.durations)
 
-    def open(self, camera: Camera | None) -> Stream:
-        """Return the sequence's stream; its first frame opens it."""
-        if self._stream is None:
-            self._stream = self.backbone.open(camera)
-        return self._stream
+    def encode(self, frame: Frame, encoded: Encoded | None = None) -> Window | None:
+        """Encode the frame (step 1) and return its window; None for the first of a segment.
 
-    def begin(self, frame: Frame, encoded: Encoded | None = None) -> Window | None:
-        """Encode the frame (step 1); return its window, None when there is nothing before it.
-
-        A frame that was encoded before need not be again.
+        `encoded` is the frame's encoding where it exists already.
         """
         stream = self.open(frame.camera)
         encoded = encoded or stream.encode(frame)
         self._newest = Keyframe(encoded, self._track(frame, encoded), self._frames_seen,
-                                self._known.T_world_latest, self._known.covariance)
+                                self._state.T_world_latest, np.zeros((6, 6)))
         self._frames_seen += 1
         if self._lost_in_a_row >= MAX_LOST_FRAMES:
-            self._start_anew()
+            self._clear_window()
         if not self._keyframes:
             return None
-        self._previous = self._known.seen_from(self._keyframes)
-        return Window(stream, tuple(frame.encoded for frame in self.window),
-                      self._previous)
+        self._prior = self._state.prior_of(self._keyframes)
+        return Window(stream, tuple(frame.encoded for frame in self.window), self._prior)
 
-    def integrate(self, estimate: Estimate | None) -> DecisionInput | bool:
-        """Align, chain and observe (steps 3 to 5); return the decision's input, or the decision.
-
-        There is nothing to decide while the window fills (keep) or for a lost frame (drop).
-        """
+    def integrate(self, estimate: Estimate | None) -> Step:
+        """Align, chain and observe (steps 3 to 5); `estimate` is None where `encode` said so."""
         if estimate is None:
-            # The first frame is the world; that of a later start is where the last one was lost,
-            # and as doubtful: nobody saw how far the camera went meanwhile.
-            self._newest.covariance = self._covariance
-            self._known = WindowState(self._newest.T_world_camera, self._covariance,
-                                      memory=self._known.memory)
-            self._status = Status.OK if self._newest.index == 0 else Status.LOST
-            self._parts = {}
-            return True
-        scale, memory_scale = 1.0, self._known.memory_scale
-        if estimate.status is not Status.LOST:
-            scale = memory_scale = self.scale.align(estimate, self._previous)
-            self._chain(scale_poses(estimate.T_anchor_frame, scale))
-        self._lost_in_a_row = self._lost_in_a_row + 1 if estimate.status is Status.LOST else 0
-        T_world_anchor = self._keyframes[0].T_world_camera
-        self._status, self._intrinsics = estimate.status, estimate.intrinsics
-        self._parts = estimate.durations
-        if self._with_covariance:
-            self._doubt(estimate, scale)
-        self._known = WindowState(
-            self._newest.T_world_camera,
-            self._known.covariance if estimate.status is Status.LOST else self._newest.covariance,
-            transform_points(estimate.points, T_world_anchor, scale), estimate.memory, memory_scale)
-        if estimate.status is Status.LOST or len(self._keyframes) < self.window_size - 1:
-            return estimate.status is not Status.LOST
-        return self._decision(estimate)
+            self._step = self._start_segment()
+        elif estimate.status is Status.LOST:
+            self._step = self._hold(estimate)
+        else:
+            self._step = self._place(estimate)
+        return self._step
 
     def commit(self, keep: bool, durations: dict[str, float]) -> Update:
         """Keep or drop the newest frame (step 6) and return what it changed."""
-        newest = self._newest
-        if keep:
-            if len(self._keyframes) == self.window_size - 1:
-                self._retire(self._keyframes.pop(0))
-                anchor = self._keyframes[0]
-                # Products of many drift away from a rotation; all that follow start from this.
-                anchor.T_world_camera = geometry.orthonormalise(anchor.T_world_camera)
-            self._keyframes.append(newest)
-            placed = FramePose(newest.encoded.stamp_ns, newest, np.eye(4), True)
-        else:
-            last = self._keyframes[-1]
-            placed = FramePose(newest.encoded.stamp_ns, last,
-                               geometry.relative(last.T_world_camera, newest.T_world_camera), False)
-            self._release(newest)
-        self._pending.append(placed)
+        newest, step = self._newest, self._step
+        self._pending.append(self._keep() if keep else self._drop())
         self._final += self._pending[:-MAX_PENDING]
         del self._pending[:-MAX_PENDING]
         final = tuple(self._final)
         self._final.clear()
-        return Update(newest.encoded.stamp_ns, newest.T_world_camera, self._covariance,
-                      self._window_covariance, self._status, keep, final,
-                      self._known.points, durations, self._intrinsics, self._parts)
+        return Update(newest.encoded.stamp_ns, newest.T_world_camera, step.covariance,
+                      step.window_covariance, step.status, keep, final, self._state.points,
+                      durations, step.intrinsics, step.durations)
 
     def finish(self) -> tuple[FramePose, ...]:
-        """Return the frames whose poses were not final yet; they are now."""
+        """Return the frames whose poses were not final yet; now they are."""
         final = (*self._final, *self._pending)
         self._final.clear()
         self._pending.clear()
         return final
+
+    def open(self, camera: Camera | None) -> Stream:
+        """Return the stream of the sequence; the first call opens it."""
+        if self._stream is None:
+            self._stream = self.backbone.open(camera)
+        return self._stream
 
     @property
     def window(self) -> tuple[Keyframe, ...]:
@@ -250,7 +150,7 @@ class KeyframeOdometry:
         return tuple(self._pending)
 
     def _track(self, frame: Frame, encoded: Encoded) -> Tracks:
-        """Return the backbone's tracks, our own if only the policy asks, or none."""
+        """Return the backbone's tracks, our own if only the policy needs them, or none."""
         if encoded.tracks is not None:
             return encoded.tracks
         if not self.policy.needs_tracks:
@@ -259,23 +159,65 @@ class KeyframeOdometry:
             self._tracker = Tracker(frame.camera)
         return self._tracker.track(to_grey(frame.image))
 
+    def _start_segment(self) -> Step:
+        """Start a window at the newest frame: at the origin, or where tracking was lost.
+
+        Nothing observed how far the camera went while lost: the last covariance stays.
+        """
+        newest = self._newest
+        newest.covariance = self._step.covariance
+        self._state = WindowState(newest.T_world_camera, memory=self._state.memory)
+        status = Status.OK if newest.index == 0 else Status.LOST
+        return replace(self._step, status=status, durations={}, decision=None, keep=True)
+
+    def _hold(self, estimate: Estimate) -> Step:
+        """Leave a lost frame at the latest pose, with the estimate's large covariance."""
+        self._lost_in_a_row += 1
+        window_covariance = self._propagate_covariance(estimate, -1, 1.0)
+        self._update_state(estimate, 1.0, self._state.memory_scale)
+        return Step(estimate.status, self._newest.covariance, window_covariance,
+                    estimate.intrinsics, estimate.durations, keep=False)
+
+    def _place(self, estimate: Estimate) -> Step:
+        """Align the scale of the window, chain its poses, and observe it once it is full."""
+        self._lost_in_a_row = 0
+        scale = self.scale.align(estimate, self._prior)
+        self._chain(scale_poses(estimate.T_anchor_frame, scale))
+        self._propagate_covariance(estimate, 1, scale)  # of the next anchor
+        window_covariance = self._propagate_covariance(estimate, -1, scale)
+        self._update_state(estimate, scale, scale)
+        full = len(self._keyframes) == self.window_size - 1
+        return Step(estimate.status, self._newest.covariance, window_covariance,
+                    estimate.intrinsics, estimate.durations,
+                    self._observe(estimate) if full else None)
+
     def _chain(self, T_anchor_frame: np.ndarray) -> None:
         """Step 4: overwrite the poses of all frames in the window but the anchor's."""
         poses = self._keyframes[0].T_world_camera @ T_anchor_frame
-        for keyframe, pose in zip((*self._keyframes[1:], self._newest), poses[1:], strict=True):
+        for keyframe, pose in zip(self.window[1:], poses[1:], strict=True):
             keyframe.T_world_camera = pose
 
-    def _doubt(self, estimate: Estimate, scale: float) -> None:
-        """Give the newest frame, and the anchor to come, their covariances in the world."""
-        anchor, frames = self._keyframes[0], self.window
-        for index in (-1,) if estimate.status is Status.LOST else (1, -1):
-            own = rotate_covariance(estimate.covariance[index], anchor.T_world_camera, scale)
-            offset = frames[index].T_world_camera[:3, 3] - anchor.T_world_camera[:3, 3]
-            frames[index].covariance = propagate_covariance(own, anchor.covariance, offset)
-        self._covariance, self._window_covariance = self._newest.covariance, own
+    def _propagate_covariance(self, estimate: Estimate, index: int, scale: float) -> np.ndarray:
+        """Set the covariance of a frame of the window; return its part relative to the anchor.
 
-    def _decision(self, estimate: Estimate) -> DecisionInput:
-        """Step 5: what the policy sees."""
+        Both are (6, 6) in world axes and trajectory units. Poses are chained before.
+        """
+        if not self._with_covariance:
+            return self._step.window_covariance
+        anchor, frame = self._keyframes[0], self.window[index]
+        relative = rotate_covariance(estimate.covariance[index], anchor.T_world_camera, scale)
+        offset = frame.T_world_camera[:3, 3] - anchor.T_world_camera[:3, 3]
+        frame.covariance = propagate_covariance(relative, anchor.covariance, offset)
+        return relative
+
+    def _update_state(self, estimate: Estimate, scale: float, memory_scale: float) -> None:
+        """Store what the next window starts from."""
+        points = transform_points(estimate.points, self._keyframes[0].T_world_camera, scale)
+        self._state = WindowState(self._newest.T_world_camera, points, estimate.memory,
+                                  memory_scale)
+
+    def _observe(self, estimate: Estimate) -> DecisionInput:
+        """Step 5: return what the policy sees."""
         frames, last = self.window, self._keyframes[-1]
         observation = observe([frame.encoded.descriptor for frame in frames],
                               np.array([frame.T_world_camera for frame in frames]),
@@ -283,8 +225,26 @@ class KeyframeOdometry:
         return DecisionInput(observation, last.tracks, self._newest.tracks,
                              self._newest.index - last.index)
 
+    def _keep(self) -> FramePose:
+        """Add the newest frame to the window; when it is full the anchor leaves."""
+        if len(self._keyframes) == self.window_size - 1:
+            self._retire(self._keyframes.pop(0))
+            anchor = self._keyframes[0]
+            # Poses are fed back: `invert` transposes the rotation, so a departure from
+            # orthonormality grows two- to threefold per window unless it is removed here.
+            anchor.T_world_camera = geometry.orthonormalise(anchor.T_world_camera)
+        self._keyframes.append(self._newest)
+        return FramePose(self._newest.encoded.stamp_ns, self._newest, np.eye(4), True)
+
+    def _drop(self) -> FramePose:
+        """Drop the newest frame: its pose hangs on the last keyframe."""
+        newest, last = self._newest, self._keyframes[-1]
+        self._release(newest)
+        return FramePose(newest.encoded.stamp_ns, last,
+                         geometry.relative(last.T_world_camera, newest.T_world_camera), False)
+
     def _retire(self, keyframe: Keyframe) -> None:
-        """Let a keyframe leave the window; the frames that hang on it are final now."""
+        """Release a keyframe that leaves the window; the frames that hang on it are final."""
         self._release(keyframe)
         count = 0
         while count < len(self._pending) and self._pending[count].keyframe is keyframe:
@@ -292,14 +252,14 @@ class KeyframeOdometry:
         self._final += self._pending[:count]
         del self._pending[:count]
 
-    def _start_anew(self) -> None:
-        """Empty the window: the next frame starts another one where the camera was last seen."""
+    def _clear_window(self) -> None:
+        """Empty the window; the next frame starts another one at the last known pose."""
         self._lost_in_a_row = 0
         for keyframe in self._keyframes:
             self._retire(keyframe)
         self._keyframes.clear()
 
     def _release(self, frame: Keyframe) -> None:
-        """Let the backbone free what it holds for a frame."""
+        """Free what the backbone holds for a frame."""
         if self._stream is not None:
             self._stream.release(frame.encoded)

@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Odometry of a running camera: each frame's pose, motion and doubt in metres, and the path."""
+"""Odometry of a running camera in metres: pose, motion, covariances, path and trajectory file."""
 
 from __future__ import annotations
 
@@ -18,27 +18,28 @@ import numpy as np
 from kfvo_ros import geometry
 from kfvo_ros.backbones.base import Status
 from kfvo_ros.errors import KfvoError, reason_of
-from kfvo_ros.odometry.keyframe_odometry import FramePose, KeyframeOdometry
+from kfvo_ros.odometry.keyframe_odometry import KeyframeOdometry
+from kfvo_ros.odometry.updates import FramePose
 from kfvo_ros.odometry.window_prior import scale_poses
 from kfvo_ros.sequences.base import Frame
 from kfvo_ros.trajectory import format_tum_line
 
 SPREAD_MEMORY = 0.05
-"""Weight of the newest final pose in the spread of arrival against final poses."""
+"""Weight of the newest final pose in the mean square difference of arrival and final poses."""
 LEAST_VARIANCE = 1e-8
-"""No pose is believed better than a tenth of a millimetre and of a milliradian."""
+"""Lower limit of all variances: 0.1 mm and 0.1 mrad, squared."""
 StampedPose = tuple[int, np.ndarray]
 """(stamp_ns, T_world_x (4, 4))."""
 
 
 @dataclass(frozen=True)
 class OnlinePose:
-    """One frame at its arrival, in metres.
+    """The pose of one frame at arrival, in metres.
 
-    ``T_world_camera`` (4, 4) with its ``covariance`` (6, 6) in the axes of the world,
-    translation first; ``T_before_camera`` (4, 4) the motion since the frame before, which was
-    ``interval_ns`` ago, with ``motion_covariance`` (6, 6) in the same axes; None for the first.
-    ``intrinsics`` K (3, 3) [px] where the backbone estimates them.
+    ``covariance`` (6, 6) of ``T_world_camera`` (4, 4) is in world axes, translation first.
+    ``T_previous_camera`` (4, 4) is the motion since the previous frame, ``interval_ns`` earlier,
+    None for the first; its ``motion_covariance`` (6, 6) is in world axes too. ``intrinsics``
+    K (3, 3) [px] is None unless the backbone estimates it.
     """
 
     stamp_ns: int
@@ -46,16 +47,16 @@ class OnlinePose:
     covariance: np.ndarray
     status: Status
     is_keyframe: bool
-    T_before_camera: np.ndarray | None
+    T_previous_camera: np.ndarray | None
     interval_ns: int
     motion_covariance: np.ndarray
     intrinsics: np.ndarray | None = None
 
 
 class OnlineOdometry:
-    """Runs one uninterrupted segment; `scale` [m per unit] multiplies all that comes out.
+    """Odometry of one uninterrupted segment; `scale` [m per unit] multiplies all output.
 
-    Final poses go to `log` at once; the last `path_length` of them, None for all, are kept.
+    Final poses are written to `log` at once; the last `path_length` are kept (None: all).
     """
 
     def __init__(self, odometry: KeyframeOdometry, log: TrajectoryLog, scale: float = 1.0,
@@ -69,40 +70,41 @@ class OnlineOdometry:
         self._last: FramePose | None = None
 
     def process(self, frame: Frame) -> OnlinePose:
-        """Take in the next frame; raises KfvoError when the frame does not fit the camera."""
+        """Estimate the pose of the next frame; raises KfvoError for a frame of another size."""
         update = self._odometry.process(frame)
         self._arrivals.append(update.T_world_camera)
         self._finalise(update.final)
-        before, self._last = self._last, self._odometry.pending[-1]
+        previous, self._last = self._last, self._odometry.pending[-1]
         motion, interval_ns = None, 0
-        if before is not None:
-            # Against the frame before as it is seen now: one window made both.
-            motion = self._metric(geometry.relative(before.T_world_camera,
+        if previous is not None:
+            # Relative to the refined previous pose: both come from the same window.
+            motion = self._metric(geometry.relative(previous.T_world_camera,
                                                     update.T_world_camera))
-            interval_ns = update.stamp_ns - before.stamp_ns
+            interval_ns = update.stamp_ns - previous.stamp_ns
         return OnlinePose(update.stamp_ns, self._metric(update.T_world_camera),
-                          self._doubt(update.covariance), update.status, update.is_keyframe,
-                          motion, interval_ns, self._doubt(update.window_covariance),
+                          self._metric_covariance(update.covariance), update.status,
+                          update.is_keyframe, motion, interval_ns,
+                          self._metric_covariance(update.window_covariance),
                           update.intrinsics)
 
     def path(self) -> list[tuple[int, np.ndarray]]:
-        """Return (stamp_ns, T_world_camera) of the latest frames as they are refined by now."""
-        pending = [(placed.stamp_ns, self._metric(placed.T_world_camera))
-                   for placed in self._odometry.pending]
+        """Return (stamp_ns, refined T_world_camera) of the latest frames."""
+        pending = [(pose.stamp_ns, self._metric(pose.T_world_camera))
+                   for pose in self._odometry.pending]
         path = [*self._path, *pending]
         return path if self._path.maxlen is None else path[-self._path.maxlen:]
 
     def save(self, path: Path) -> int:
-        """Write all poses so far to a new TUM file; return how many. Raises KfvoError."""
+        """Write all poses so far to a new TUM file; return their number. Raises KfvoError."""
         return self._log.save(path, self._lines(self._odometry.pending))
 
     def finish(self) -> None:
-        """Complete the log: no frame follows."""
+        """Write the remaining poses and close the log."""
         self._finalise(self._odometry.finish())
         self._log.close()
 
     def _finalise(self, final: Iterable[FramePose]) -> None:
-        """Log final poses and learn from them how far off the estimates at arrival were."""
+        """Log final poses; update the spread of their differences to the poses at arrival."""
         lines = self._lines(final)
         for _, T_world_camera in lines:
             arrival = self._metric(self._arrivals.popleft())
@@ -112,25 +114,25 @@ class OnlineOdometry:
         self._path.extend(lines)
         self._log.append(lines)
 
-    def _lines(self, placed: Iterable[FramePose]) -> list[tuple[int, np.ndarray]]:
-        return [(each.stamp_ns, self._metric(each.T_world_camera)) for each in placed]
+    def _lines(self, poses: Iterable[FramePose]) -> list[tuple[int, np.ndarray]]:
+        return [(each.stamp_ns, self._metric(each.T_world_camera)) for each in poses]
 
     def _metric(self, pose: np.ndarray) -> np.ndarray:
         """Return a pose (4, 4) of trajectory units in metres."""
         return scale_poses(pose, self._scale)
 
-    def _doubt(self, covariance: np.ndarray) -> np.ndarray:
-        """Return what the backbone doubts, in metres, and what windows disagree on."""
+    def _metric_covariance(self, covariance: np.ndarray) -> np.ndarray:
+        """Return the backbone's covariance in metres plus the spread between windows."""
         unit = np.repeat([self._scale, 1.0], 3)
         total = covariance * np.outer(unit, unit) + self._spread + LEAST_VARIANCE * np.eye(6)
         return 0.5 * (total + total.T)
 
 
 class TrajectoryLog:
-    """Appends final poses to a new TUM file at `path`, or to a nameless temporary one.
+    """A new TUM file at `path` (None: an unnamed temporary file) to which poses are appended.
 
-    ``path`` is None for the latter. Raises KfvoError when the file exists already or cannot be
-    written; when a later write fails, ``problem`` tells and no more is written.
+    Raises KfvoError when the file exists already or cannot be created. When a later write fails,
+    ``problem`` holds the error and nothing more is written.
     """
 
     def __init__(self, path: Path | None = None) -> None:
@@ -144,10 +146,10 @@ class TrajectoryLog:
             self._file = _create(path)
 
     def append(self, poses: Iterable[StampedPose]) -> None:
-        """Append poses, and see to it that they are on disk."""
+        """Append poses and flush them to disk."""
         if self.problem is None:
             lines = [format_tum_line(*pose) for pose in poses]
-            with self._told():
+            with self._writing_errors():
                 self._file.writelines(lines)
                 self._file.flush()
                 self._count += len(lines)
@@ -169,14 +171,14 @@ class TrajectoryLog:
 
     def close(self) -> None:
         """Close the file; an empty one is not left behind."""
-        with self._told():
-            self._file.close()  # where the disk is full, what it still holds fails again
+        with self._writing_errors():
+            self._file.close()  # flushes, which fails again where the disk is full
         if self.path is not None and self._count == 0:
             self.path.unlink(missing_ok=True)
 
     @contextmanager
-    def _told(self) -> Iterator[None]:
-        """Keep a failure to write as the problem: a full disk must not end an odometry."""
+    def _writing_errors(self) -> Iterator[None]:
+        """Store a write error as the problem: a full disk must not end the odometry."""
         try:
             yield
         except OSError as error:

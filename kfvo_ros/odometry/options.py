@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What users may choose, declared once: command lines and the node's parameters follow."""
+"""Options of odometry, of the VGGT backbone, and of how a sequence is read."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from kfvo_ros.utils.config import option
 
 @dataclass(frozen=True)
 class OdometryOptions:
-    """The method's choices."""
+    """Options of the odometry."""
 
     backbone: str = option('geometric', 'model that places the frames of a window: geometric '
                            'on any processor, vggt on a GPU', ('geometric', 'vggt'))
@@ -38,7 +38,7 @@ class OdometryOptions:
 
 @dataclass(frozen=True)
 class VggtOptions:
-    """The VGGT backbone's choices."""
+    """Options of the VGGT backbone."""
 
     weights: str = option(
         'facebook/VGGT-1B', 'vggt: repository on the Hugging Face hub, or a .safetensors or .pt '
@@ -73,4 +73,4 @@ class SequenceOptions:
     ground_truth_to_camera: str | None = option(
         None, 'where the camera is on the body of the ground truth: "x y z qx qy qz qw"')
     rate: float = option(10.0, 'frames per second of what has no stamps [Hz]', least=1e-3)
-    stop: int | None = option(None, 'stop after so many frames', least=1)
+    stop: int | None = option(None, 'stop after this many frames', least=1)

@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Scale of a window against the trajectory so far: the rules `none`, `translation`, `depth`."""
+"""Scale of a window relative to the trajectory: the rules `none`, `translation` and `depth`."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from kfvo_ros.tracking import tracker
 
 SCALE_RULES = ('none', 'translation', 'depth')
 MIN_SHARED_POINTS = 8
-"""With fewer points in common their depths do not tell the scale."""
+"""Fewer shared points do not determine the scale."""
 STANDSTILL = 1e-3
-"""Keyframes closer to the anchor than this share of the window's extent tell no scale."""
+"""Keyframes closer to the anchor than this share of the window's extent determine no scale."""
 LEAST_AGREEMENT = 0.98
-"""Nor do keyframes whose known and new places agree less, as a cosine: while a camera stands both
-are noise, and a ratio of noise in every window would carry the scale away."""
+"""Cosine between known and new positions below which they determine no scale: of a camera at rest
+both are noise, and their ratio in every window would make the scale drift."""
 
 
 class ScaleAligner:
-    """Trajectory units per unit of a window; remembers the last answer and the scene's depths.
+    """Estimates trajectory units per unit of a window; keeps the last scale and depths.
 
-    `rule`: ``none`` trusts the backbone's unit, ``translation`` compares the keyframes' known
-    distances to the anchor with the new ones, ``depth`` compares the depths of shared points
-    and falls back to ``translation`` without them.
+    `rule`: ``none`` uses the backbone's unit (the paper's rule), ``translation`` compares the
+    distances of the keyframes to the anchor with the known ones, ``depth`` compares the depths
+    of shared points and falls back to ``translation`` without them.
     """
 
     def __init__(self, rule: str) -> None:
@@ -32,18 +32,18 @@ class ScaleAligner:
         self._last = 1.0
         self._depths = np.ones(1)
 
-    def align(self, estimate: Estimate, previous: WindowPrior | None) -> float:
+    def align(self, estimate: Estimate, prior: WindowPrior | None) -> float:
         """Return the factor that brings `estimate` into trajectory units."""
         if self.rule == 'none':
             return 1.0
-        if previous is None or (previous.points is None and estimate.points is not None):
+        if prior is None or (prior.points is None and estimate.points is not None):
             self._last = self._from_median_depth(estimate.points)
         else:
             scale = None
             if self.rule == 'depth':
-                scale = compare_depths(previous.points, estimate.points)
+                scale = compare_depths(prior.points, estimate.points)
             if scale is None:
-                scale = compare_translations(previous.T_anchor_frame, estimate.T_anchor_frame)
+                scale = compare_translations(prior.T_anchor_frame, estimate.T_anchor_frame)
             self._last = self._last if scale is None else scale
         if estimate.points is not None and len(estimate.points.ids):
             self._depths = self._last * estimate.points.depths
@@ -60,7 +60,7 @@ def compare_depths(known: Points | None, new: Points | None) -> float | None:
     """Return the information-weighted median ratio of known to new depths."""
     if known is None or new is None:
         return None
-    in_known, in_new = tracker.shared(known.ids, new.ids)
+    in_known, in_new = tracker.match_ids(known.ids, new.ids)
     if len(in_known) < MIN_SHARED_POINTS:
         return None
     ratios = known.depths[in_known] / np.maximum(new.depths[in_new], 1e-12)

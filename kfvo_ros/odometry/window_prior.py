@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What one window leaves to the next: poses and points, in the world."""
+"""State passed from window to window: poses and points in the world, with covariance."""
 
 from __future__ import annotations
 
@@ -22,37 +22,37 @@ class HasPose(Protocol):
 
 @dataclass(frozen=True)
 class WindowState:
-    """The latest frame's pose, the latest points in the world, and the backbone's memory.
+    """The latest pose T_world_latest (4, 4), the points in the world, the backbone's memory.
 
-    ``covariance`` (6, 6) is that of the pose where a frame was last placed.
+    ``memory_scale`` is trajectory units per unit of ``memory``.
     """
 
     T_world_latest: np.ndarray = field(default_factory=lambda: np.eye(4))
-    covariance: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
     points: Points | None = None
     memory: Any = None
     memory_scale: float = 1.0
 
-    def seen_from(self, keyframes: Sequence[HasPose]) -> WindowPrior | None:
-        """Return the hint for a window that starts with `keyframes`; None before any estimate."""
+    def prior_of(self, keyframes: Sequence[HasPose]) -> WindowPrior | None:
+        """Return the prior of a window that starts with `keyframes`; None before any estimate."""
         if len(keyframes) == 1 and self.memory is None and self.points is None:
             return None
         T_anchor_world = geometry.invert(keyframes[0].T_world_camera)
         T_anchor_frame = T_anchor_world @ np.array([k.T_world_camera for k in keyframes])
         T_anchor_frame[0] = np.eye(4)
         return WindowPrior(T_anchor_frame, T_anchor_world @ self.T_world_latest,
-                           transform_points(self.points, T_anchor_world, 1.0), self.memory, self.memory_scale)
+                           transform_points(self.points, T_anchor_world, 1.0),
+                           self.memory, self.memory_scale)
 
 
 def scale_poses(poses: np.ndarray, scale: float) -> np.ndarray:
-    """Return poses (..., 4, 4) in another unit."""
+    """Return poses (..., 4, 4) with translations multiplied by `scale`."""
     result = poses.copy()
     result[..., :3, 3] *= scale
     return result
 
 
 def transform_points(points: Points | None, T_b_a: np.ndarray, scale: float) -> Points | None:
-    """Return points of frame a, in another unit, in frame b."""
+    """Return points in frame b of points in frame a, multiplied by `scale` first."""
     if points is None:
         return None
     positions = scale * points.positions @ T_b_a[:3, :3].T + T_b_a[:3, 3]
@@ -60,18 +60,20 @@ def transform_points(points: Points | None, T_b_a: np.ndarray, scale: float) -> 
 
 
 def rotate_covariance(covariance: np.ndarray, T_b_a: np.ndarray, scale: float) -> np.ndarray:
-    """Return a covariance (6, 6) of frame a, in another unit, in the axes of frame b."""
+    """Return a covariance (6, 6), translation first, in the axes of b; translations are scaled."""
     into = np.zeros((6, 6))
     into[:3, :3], into[3:, 3:] = scale * T_b_a[:3, :3], T_b_a[:3, :3]
     return into @ covariance @ into.T
 
 
-def propagate_covariance(covariance: np.ndarray, of_carrier: np.ndarray, offset: np.ndarray) -> np.ndarray:
-    """Return the covariance (6, 6) of a frame whose carrier is uncertain too.
+def propagate_covariance(relative: np.ndarray, reference: np.ndarray,
+                         offset: np.ndarray) -> np.ndarray:
+    """Return the covariance (6, 6) of a frame relative to an uncertain reference frame.
 
-    `covariance` is the frame's against its carrier, `offset` (3,) leads from there to the frame;
-    all in the axes of one world. Where the carrier is turned, the frame is moved.
+    `relative` is the covariance of the frame relative to the reference, `reference` that of the
+    reference, `offset` (3,) leads from the reference to the frame; all in world axes. A rotation
+    of the reference moves the frame: the lever arm.
     """
     lever = np.eye(6)
     lever[:3, 3:] = -geometry.skew(offset)
-    return lever @ of_carrier @ lever.T + covariance
+    return lever @ reference @ lever.T + relative

@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the node counts and times, and its message on /diagnostics."""
+"""Counters, rates and latencies of the node, and their message on /diagnostics."""
 
 from __future__ import annotations
 
@@ -14,52 +14,57 @@ from std_msgs.msg import Header
 from kfvo_ros.backbones.base import Status
 from kfvo_ros.utils.process import rss_mb
 
-SILENCE_S = 5.0
-"""Without an image for so long, something is wrong."""
-RECENT, RECENT_LATENCIES = 100, 1000
-"""Rates and latencies are those of so many frames."""
+IMAGE_TIMEOUT_S = 5.0
+"""Time without an image after which the level is WARN."""
+RATE_FRAMES, LATENCY_FRAMES = 100, 1000
+"""Number of latest frames behind a rate and behind a latency percentile."""
 
 
 class Diagnostics:
     """Counters of one node; every method may be called from any thread.
 
-    ``missed`` images were lost before the node got them. ``problem`` is what keeps the node from
-    working now, in words, or empty; it is cleared by the next frame that gets a pose.
+    ``lost_in_transit`` counts images lost before the node received them, ``frames_lost`` frames
+    of status LOST. ``problem`` says why images are refused at present, or is empty; the next
+    frame that gets a pose clears it.
     """
 
     def __init__(self) -> None:
         self.started = time.monotonic()
         self.received = self.processed = self.keyframes = self.dropped = self.refused = 0
-        self.missed = self.lost = self.resets = 0
+        self.lost_in_transit = self.frames_lost = self.resets = 0
         self.paused = False
         self.status: Status | None = None
         self.problem = ''
         self._intrinsics: np.ndarray | None = None
-        self._arrivals: deque[float] = deque(maxlen=RECENT)
-        self._departures: deque[float] = deque(maxlen=RECENT)
-        self._latencies: deque[float] = deque(maxlen=RECENT_LATENCIES)
+        self._arrivals: deque[float] = deque(maxlen=RATE_FRAMES)
+        self._departures: deque[float] = deque(maxlen=RATE_FRAMES)
+        self._latencies: deque[float] = deque(maxlen=LATENCY_FRAMES)
 
-    def image(self) -> float:
+    def record_image(self) -> float:
         """Count an image and return its time of arrival [s, monotonic]."""
         now = time.monotonic()
         self.received += 1
         self._arrivals.append(now)
         return now
 
-    def posed(self, arrival: float, status: Status, is_keyframe: bool,
-              intrinsics: np.ndarray | None = None) -> None:
-        """Count a frame whose pose has just been published, with K (3, 3) [px] if it was seen."""
+    def record_pose(self, arrival: float, status: Status, is_keyframe: bool,
+                    intrinsics: np.ndarray | None = None) -> None:
+        """Count a frame at the publication of its pose.
+
+        `arrival` is the image's [s, monotonic]; `intrinsics` are K (3, 3) [px] where the backbone
+        estimates them.
+        """
         now = time.monotonic()
         self.processed += 1
         self.keyframes += is_keyframe
-        self.lost += status is Status.LOST
+        self.frames_lost += status is Status.LOST
         self.status, self.problem = status, ''
         self._intrinsics = intrinsics
         self._departures.append(now)
         self._latencies.append(now - arrival)
 
     @property
-    def silence(self) -> float:
+    def seconds_without_image(self) -> float:
         """Seconds since the last image, or since the start."""
         return time.monotonic() - (self._arrivals[-1] if self._arrivals else self.started)
 
@@ -78,12 +83,12 @@ class Diagnostics:
             'output rate [Hz]': f'{_rate(self._departures):.1f}',
             'latency median [ms]': f'{self.latency_ms(50):.1f}',
             'latency 95 % [ms]': f'{self.latency_ms(95):.1f}',
-            'images lost in transit': self.missed,
+            'images lost in transit': self.lost_in_transit,
             'images received': self.received, 'images processed': self.processed,
             'images dropped': self.dropped, 'images refused': self.refused,
             'keyframes': self.keyframes,
             'keyframe ratio': f'{self.keyframes / max(self.processed, 1):.3f}',
-            'frames lost': self.lost, 'resets': self.resets,
+            'frames lost': self.frames_lost, 'resets': self.resets,
             'memory [MiB]': f'{rss_mb():.0f}', **constants}
         if self._intrinsics is not None:
             values['focal lengths as estimated [px]'] = \
@@ -97,8 +102,9 @@ class Diagnostics:
         """Return level and message."""
         if self.paused:
             return DiagnosticStatus.OK, 'paused'
-        if self.silence > SILENCE_S:
-            return DiagnosticStatus.WARN, f'no image on {topic} for {self.silence:.0f} s'
+        if self.seconds_without_image > IMAGE_TIMEOUT_S:
+            return (DiagnosticStatus.WARN,
+                    f'no image on {topic} for {self.seconds_without_image:.0f} s')
         if self.problem:
             return DiagnosticStatus.WARN, self.problem
         if self.status is Status.LOST:
@@ -107,8 +113,8 @@ class Diagnostics:
 
 
 def _rate(times: deque[float]) -> float:
-    """Return events per second over the last ones; zero once they have stopped."""
+    """Return the events per second of `times` [s]; zero once no event has come for a while."""
     recent = list(times)
-    if len(recent) < 2 or time.monotonic() - recent[-1] > SILENCE_S:
+    if len(recent) < 2 or time.monotonic() - recent[-1] > IMAGE_TIMEOUT_S:
         return 0.0
     return (len(recent) - 1) / max(recent[-1] - recent[0], 1e-9)

@@ -1,37 +1,22 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""ROS parameters from dataclasses of options: declared, described, checked in readable lines."""
+"""Options of the node and of the player; the node's are its ROS parameters.
+
+Needs no rclpy: command lines, launch files and documents read them too.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from typing import Any
+from collections.abc import Iterable
+from dataclasses import dataclass
 
-from kfvo_ros.utils.config import option
-
-
-@dataclass(frozen=True)
-class PlayOptions:
-    """What of a bag is played, and how."""
-
-    topic: tuple[str, ...] = option(
-        (), 'play only this topic; may be given several times. Default: all topics, but of '
-        'several image topics only the first by name')
-    rate: float = option(1.0, 'speed; 2 is twice as fast as recorded', least=1e-3, most=1e3)
-    start: float = option(0.0, 'skip so much of the beginning of the bag [s]', least=0.0, most=1e9)
-    duration: float | None = option(None, 'play so much of the bag [s]; default: all',
-                                    least=1e-3, most=1e9)
-    loop: bool = option(False, 'begin again at the end, until interrupted')
-    clock: float | None = option(None, 'publish the time of the bag on /clock, so often [Hz]; '
-                                 '40 without a value', least=1e-3, most=1e3, bare=40.0)
-    wait_for_subscribers: int | None = option(
-        None, 'begin when the image topic has so many subscribers (without images: every topic); '
-        '1 without a value', least=1, bare=1)
+from kfvo_ros.odometry.options import OdometryOptions, VggtOptions
+from kfvo_ros.utils.config import Option, option, options_of
 
 
 @dataclass(frozen=True)
 class NodeOptions:
-    """What the node listens to, and what it says."""
+    """What kfvo_node subscribes to and publishes."""
 
     image_topic: str = option(
         'image', 'images to follow; remapping image does the same. Ends in /compressed for '
@@ -43,7 +28,7 @@ class NodeOptions:
     camera_info_file: str = option(
         '', 'calibration file (camera_info.yaml), which wins over the topic')
     queue_size: int = option(
-        1, 'images that may wait while one is worked on; of more, the oldest are dropped',
+        1, 'images that may wait while one is processed; the oldest of more are dropped',
         least=1, most=1000)
     process_every_frame: bool = option(
         False, 'drop nothing and lag behind instead, for bags (up to 1000 images)')
@@ -65,10 +50,38 @@ class NodeOptions:
         '', 'TUM file that grows as poses become final; a number is added to a name that is taken')
 
 
-def describe(*kinds: type[Any]) -> str:
-    """Return a text that lists the parameters, their defaults and their meaning."""
+@dataclass(frozen=True)
+class PlayOptions:
+    """What kfvo_play publishes of a bag, and how."""
+
+    topic: tuple[str, ...] = option(
+        (), 'play only this topic; may be given several times. Default: all topics, but of '
+        'several image topics only the first by name')
+    rate: float = option(1.0, 'speed; 2 is twice as fast as recorded', least=1e-3, most=1e3)
+    start: float = option(0.0, 'start this far into the bag [s]', least=0.0, most=1e9)
+    duration: float | None = option(None, 'play this much of the bag [s]; default: all',
+                                    least=1e-3, most=1e9)
+    loop: bool = option(False, 'start again at the end, until interrupted')
+    clock: float | None = option(None, 'publish the time of the bag on /clock at this rate [Hz]; '
+                                 '40 without a value', least=1e-3, most=1e3, bare=40.0)
+    wait_for_subscribers: int | None = option(
+        None, 'start when the image topic has this many subscribers (without images: every topic); '
+        '1 without a value', least=1, bare=1)
+
+
+PARAMETERS = (NodeOptions, OdometryOptions, VggtOptions)
+"""The options dataclasses whose fields are the parameters of kfvo_node."""
+
+
+def node_parameters() -> tuple[Option, ...]:
+    """Return all parameters of kfvo_node, in the order of its documentation."""
+    return tuple(declared for kind in PARAMETERS for declared in options_of(kind))
+
+
+def describe(parameters: Iterable[Option]) -> str:
+    """Return a text with a line for each parameter: name, meaning, choices and default."""
     return '\n'.join(
-        f'  {declared.name}: {declared.metadata["description"]}'
-        + (f' ({", ".join(declared.metadata["choices"])})' if declared.metadata['choices'] else '')
-        + (f' [{declared.default}]' if declared.default not in (None, '') else '')
-        for kind in kinds for declared in fields(kind))
+        f'  {each.name}: {each.description}'
+        + (f' ({", ".join(each.choices)})' if each.choices else '')
+        + (f' [{each.default}]' if each.default not in (None, '') else '')
+        for each in parameters)

@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the node says: Odometry for every image, keyframes, Path now and then, TF."""
+"""The node's outputs: Odometry per image, keyframe poses, a throttled Path, TF."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from kfvo_ros.ros.frames import BaseFrame, TransformSender
 from kfvo_ros.ros.messages import make_odometry, make_path, make_pose, make_transform
 from kfvo_ros.ros.options import NodeOptions
 
-QUIET_S = 5.0
-"""What is wrong with every image, or keeps every pose back, is logged once in so many seconds."""
+LOG_PERIOD_S = 5.0
+"""Least time between two log lines about a problem that concerns every image."""
 
 
 class Publishers:
-    """Publishes poses of the base, once it is known where the camera is on it."""
+    """Publishes poses of the base; nothing before T_base_camera is known."""
 
     def __init__(self, node: Node, options: NodeOptions) -> None:
         self._logger = node.get_logger()
@@ -37,18 +37,19 @@ class Publishers:
         self._path = node.create_publisher(
             Path, '~/path', QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
         self._path_period_s = 1.0 / options.path_rate
-        self._path_time = -self._path_period_s
-        self._news = False
+        self._path_published_s = -self._path_period_s
+        self._path_outdated = False
         self._T_base_camera: np.ndarray | None = None
         self._camera_frame = ''
 
     def publish(self, pose: OnlinePose, camera_frame: str) -> None:
         """Send one frame's Odometry and transform, and its pose again if it is a keyframe."""
-        self._news = True
+        self._path_outdated = True
         if camera_frame != self._camera_frame or self._T_base_camera is None:
-            self._mount(camera_frame)
+            self._look_up_camera(camera_frame)
         if self._T_base_camera is None:
-            self._logger.warning(self._base.problem(camera_frame), throttle_duration_sec=QUIET_S)
+            self._logger.warning(self._base.problem(camera_frame),
+                                 throttle_duration_sec=LOG_PERIOD_S)
             return
         motion = base_motion(pose, self._T_base_camera)
         child = self._base.name(camera_frame)
@@ -62,19 +63,19 @@ class Publishers:
                                          motion.T_odom_base))
 
     def publish_path(self, path: Callable[[], list[tuple[int, np.ndarray]]]) -> None:
-        """Send the camera's `path`, in the base's place, if it is time and somebody looks."""
+        """Send the camera's `path` as that of the base, if it is due and has subscribers."""
         now = time.monotonic()
-        if self._T_base_camera is None or not self._news \
-                or now - self._path_time < self._path_period_s \
+        if self._T_base_camera is None or not self._path_outdated \
+                or now - self._path_published_s < self._path_period_s \
                 or self._path.get_subscription_count() == 0:
             return
-        self._path_time, self._news = now, False
+        self._path_published_s, self._path_outdated = now, False
         T_base_camera = self._T_base_camera
         self._path.publish(make_path(self._odom_frame, (
             (stamp_ns, base_pose(pose, T_base_camera)) for stamp_ns, pose in path())))
 
-    def _mount(self, camera_frame: str) -> None:
-        """Look up where this camera is on the base, and say so."""
+    def _look_up_camera(self, camera_frame: str) -> None:
+        """Look up T_base_camera of this camera; log the frames once it is found."""
         self._camera_frame = camera_frame
         self._T_base_camera = self._base.transform(camera_frame)
         if self._T_base_camera is not None:

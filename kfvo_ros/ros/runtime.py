@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A command's use of ROS, from its first call to its last."""
+"""Start and shutdown of ROS around a command's node."""
 
 from __future__ import annotations
 
@@ -30,16 +30,18 @@ def remove_ros_arguments(arguments: list[str]) -> list[str]:
 
 
 @contextmanager
-def spinning_node(make: Callable[[], AnyNode], arguments: list[str]) -> Iterator[AnyNode]:
-    """Give a node, named and remapped by the ROS arguments among `arguments`, served by a thread.
+def spinning_node(make_node: Callable[[], AnyNode], arguments: list[str]) -> Iterator[AnyNode]:
+    """Yield a node whose callbacks run in a thread; destroy it and shut ROS down at the end.
 
-    Signals are left to Python, so that the node lives, and may publish, until the ``with`` ends.
+    `arguments` may hold ROS arguments, which name, remap and configure the node. Signals are left
+    to Python: the node can publish until the ``with`` ends. Raises KfvoError for ROS arguments
+    that rclpy refuses.
     """
     with _ros_errors():
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
     try:
         with _ros_errors():
-            node = make()
+            node = make_node()
         executor = SingleThreadedExecutor()
         executor.add_node(node)
         thread = threading.Thread(target=_spin, args=[executor, node.get_logger()],
@@ -56,7 +58,7 @@ def spinning_node(make: Callable[[], AnyNode], arguments: list[str]) -> Iterator
 
 
 def _spin(executor: SingleThreadedExecutor, logger: RcutilsLogger) -> None:
-    """Serve callbacks; the error of one does not end the others."""
+    """Run callbacks until shutdown; log an error of one and go on."""
     while True:
         try:
             executor.spin()
@@ -69,8 +71,8 @@ def _spin(executor: SingleThreadedExecutor, logger: RcutilsLogger) -> None:
 
 @contextmanager
 def _ros_errors() -> Iterator[None]:
-    """Turn what rclpy raises about arguments into a KfvoError."""
+    """Turn rclpy's errors about arguments into a KfvoError."""
     try:
         yield
     except RuntimeError as error:  # the base of rclpy's own errors
-        raise KfvoError(f'these ROS arguments do not work: {reason_of(error)}') from error
+        raise KfvoError(f'invalid ROS arguments: {reason_of(error)}') from error

@@ -1,10 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What was lost before a subscription's callback, from the numbers its messages carry.
-
-The message-lost event of ROS 2 knows of what the transport lost, not of what newer messages
-pushed out of a full queue. The numbers that publishers give their messages show both.
-"""
+"""Subscriptions: QoS taken from the publishers, lost messages counted, and the calibration."""
 
 from __future__ import annotations
 
@@ -35,47 +31,14 @@ from kfvo_ros.sequences.bag.camera import camera_from_info, camera_info_topic, i
 from kfvo_ros.utils.files import find_config
 
 POLL_S = 0.1
-"""How often to look for a publisher."""
-WAITING = 'waiting'
-"""The reliability of no subscription yet."""
-
-
-class SequenceGapCounter:
-    """Finds gaps in the numbers of one subscription's messages.
-
-    rclpy does not tell which of several publishers sent a message, nor need it: whichever of
-    them a number is taken to continue, the gaps have the same sum.
-    """
-
-    def __init__(self) -> None:
-        self._publishers = 0
-        self._last: list[int] = []
-
-    def begin(self, publishers: int) -> None:
-        """Count from anew: one of so many publishers is new, and its numbers begin anywhere."""
-        self._publishers = publishers
-        self._last.clear()
-
-    def missing(self, number: int | None) -> int:
-        """Return how many messages before `number` never came; None, of some DDS, tells nothing.
-
-        What was published before a publisher's first message that came does not count.
-        """
-        if number is None:
-            return 0
-        last = max((each for each in self._last if each < number), default=None)
-        if last is None or (number - last > 1 and len(self._last) < self._publishers):
-            self._last.append(number)
-            return 0
-        self._last[self._last.index(last)] = number
-        return number - last - 1
+"""Period of the search for publishers."""
 
 
 class QosMatchingSubscription:
-    """Subscribes to `topic` as soon as somebody publishes it, as reliably as they do.
+    """Subscribes to `topic` once it has publishers, with their reliability and durability.
 
     `reliability` is auto, reliable or best_effort; the last two subscribe at once. ``lost``
-    counts the messages that did not come between others that did.
+    counts the messages that are missing between received ones.
     """
 
     def __init__(self, node: Node, message_type: Any, topic: str, depth: int,
@@ -83,43 +46,43 @@ class QosMatchingSubscription:
         self.topic = node.resolve_topic_name(topic)
         self._node, self._type, self._callback = node, message_type, callback
         self._depth = depth
-        self._numbering = SequenceGapCounter()
+        self._gaps = SequenceGapCounter()
         self.lost = 0
         self._auto = reliability == 'auto'
         self._subscription: Subscription | None = None
         if self._auto:
-            # Not the node's clock: simulated time stands still until somebody publishes it.
-            self._timer = node.create_timer(POLL_S, self._follow,
+            # Not the node's clock: simulated time stands still until /clock is published.
+            self._timer = node.create_timer(POLL_S, self._match_publishers,
                                             clock=Clock(clock_type=ClockType.STEADY_TIME))
         else:
             self._subscribe(ReliabilityPolicy[reliability.upper()], DurabilityPolicy.VOLATILE)
 
     @property
-    def reliability(self) -> str:
-        """What was subscribed with: reliable, best_effort, or WAITING."""
+    def reliability(self) -> str | None:
+        """Reliability of the subscription: reliable, best_effort, or None without one."""
         if self._subscription is None:
-            return WAITING
+            return None
         return str(self._subscription.qos_profile.reliability.name).lower()
 
     def problem(self) -> str:
-        """Return why nothing may come, with what to do; empty where all looks well."""
-        name = _name_of(self._type)
+        """Return why no message may come, with the remedy; empty if no reason is known."""
+        name = _type_name(self._type)
         types = dict(self._node.get_topic_names_and_types())
-        found = [kind for kind in types.get(self.topic, []) if kind != name]
+        found = [other for other in types.get(self.topic, []) if other != name]
         if self._node.count_publishers(self.topic) == 0:
-            others = sorted(topic for topic, kinds in types.items()
-                            if name in kinds and topic != self.topic)
-            return (f'nobody publishes {self.topic}; '
+            others = sorted(topic for topic, names in types.items()
+                            if name in names and topic != self.topic)
+            return (f'{self.topic} has no publisher; '
                     + (f'topics of that type: {", ".join(others)}' if others
                        else f'there is no topic of type {name} at all'))
         if found:
             return f'{self.topic} carries {", ".join(found)}, expected {name}'
         return ''
 
-    def _follow(self) -> None:
+    def _match_publishers(self) -> None:
         """Subscribe like the publishers; one best-effort publisher makes it best effort."""
         publishers = [info for info in self._node.get_publishers_info_by_topic(self.topic)
-                      if info.topic_type == _name_of(self._type)]
+                      if info.topic_type == _type_name(self._type)]
         if not publishers:
             return
         self._timer.cancel()
@@ -137,77 +100,103 @@ class QosMatchingSubscription:
     def _subscribe(self, reliability: ReliabilityPolicy, durability: DurabilityPolicy) -> None:
         qos = QoSProfile(depth=self._depth, history=HistoryPolicy.KEEP_LAST,
                          reliability=reliability, durability=durability)
-        self._numbering = SequenceGapCounter()
-        receive: Callable[..., None] = self._receive  # whose second argument rclpy's types lack
+        self._gaps = SequenceGapCounter()
+        on_message: Callable[..., None] = self._on_message  # rclpy's types lack its 2nd argument
         self._subscription = self._node.create_subscription(
-            self._type, self.topic, receive, qos,
-            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=self._incompatible,
-                                                       matched=self._matched))
+            self._type, self.topic, on_message, qos,
+            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=self._on_incompatible_qos,
+                                                       matched=self._on_matched))
 
-    def _receive(self, message: Any, info: dict[str, Any]) -> None:
-        self.lost += self._numbering.missing(info['publication_sequence_number'])
+    def _on_message(self, message: Any, info: dict[str, Any]) -> None:
+        self.lost += self._gaps.missing_before(info['publication_sequence_number'])
         self._callback(message)
 
-    def _matched(self, event: QoSSubscriptionMatchedInfo) -> None:
-        """A publisher came or went; of one that came, this is told before its messages."""
+    def _on_matched(self, event: QoSSubscriptionMatchedInfo) -> None:
+        """Handle a new publisher; rclpy reports it before its first message."""
         if event.total_count_change > 0:
-            self._numbering.begin(event.current_count)
+            self._gaps.reset(event.current_count)
 
-    def _incompatible(self, event: QoSRequestedIncompatibleQoSInfo) -> None:
-        """A publisher offers less than was asked for: ask for less, or tell how to."""
+    def _on_incompatible_qos(self, event: QoSRequestedIncompatibleQoSInfo) -> None:
+        """Subscribe again with what the publishers offer, or log the remedy."""
         policy = QoSPolicyKind(event.last_policy_kind).name.lower()
         if not self._auto:
             self._node.get_logger().error(
-                f'a publisher of {self.topic} does not offer the {policy} that was asked for, so '
-                'nothing comes from it: set image_qos to auto or best_effort')
+                f'a publisher of {self.topic} does not offer the requested {policy}, so nothing '
+                'is received from it: set image_qos to auto or best_effort')
             return
         self._node.get_logger().warning(
-            f'a publisher of {self.topic} offers another {policy}: subscribing anew')
-        self._timer.reset()  # not here, where the subscription is being served
+            f'a publisher of {self.topic} offers another {policy}: subscribing again')
+        self._timer.reset()  # not here, while the executor serves this subscription
 
 
-def _name_of(message_type: Any) -> str:
-    """Return a type's name, like sensor_msgs/msg/Image."""
-    package, folder, _ = message_type.__module__.split('.', 2)
-    return f'{package}/{folder}/{message_type.__name__}'
+class SequenceGapCounter:
+    """Counts gaps in the sequence numbers of one subscription's messages.
+
+    The message-lost event of ROS 2 covers what the transport lost, not what newer messages
+    pushed out of a full queue; gaps show both. rclpy does not report which of several publishers
+    sent a message. It need not: whichever of them a number is assigned to, the gaps have the
+    same sum.
+    """
+
+    def __init__(self) -> None:
+        self._publishers = 0
+        self._last: list[int] = []
+
+    def reset(self, publishers: int) -> None:
+        """Forget all numbers: one of `publishers` is new, and its numbers start anywhere."""
+        self._publishers = publishers
+        self._last.clear()
+
+    def missing_before(self, number: int | None) -> int:
+        """Return the number of messages missing before `number`.
+
+        Zero for None, which some DDS report, and for what precedes a publisher's first message.
+        """
+        if number is None:
+            return 0
+        last = max((each for each in self._last if each < number), default=None)
+        if last is None or (number - last > 1 and len(self._last) < self._publishers):
+            self._last.append(number)
+            return 0
+        self._last[self._last.index(last)] = number
+        return number - last - 1
 
 
 class CameraSource:
-    """The calibration of the images of `image_topic`; nothing is ever guessed.
+    """Calibration of the images of `image_topic`, from a file or a CameraInfo topic.
 
-    A `file`, also one of config/ by its name, wins over the `info_topic`, which is by default
-    beside the images. Of a rectified topic's CameraInfo, P is taken. Raises KfvoError for a
-    file that is none.
+    A `file`, also one of config/ by its name, takes precedence over `info_topic`, which defaults
+    to camera_info beside the images. A rectified topic's camera is P of its CameraInfo. Raises
+    KfvoError for a file that is not a calibration.
     """
 
     def __init__(self, node: Node, image_topic: str, info_topic: str = '',
                  file: str = '') -> None:
         self._rectified = is_rectified(image_topic)
         self._info: CameraInfo | None = None
-        self._came = threading.Event()
-        self._fixed = read_camera_info(find_config(file)) if file else None
-        self._following = None
+        self._received = threading.Event()
+        self._file_camera = read_camera_info(find_config(file)) if file else None
+        self._subscription = None
         self.name = file
-        if self._fixed is None:
-            self._following = QosMatchingSubscription(node, CameraInfo,
-                                                      info_topic or camera_info_topic(image_topic), 1,
-                                                      self._keep)
-            self.name = self._following.topic
+        if self._file_camera is None:
+            self._subscription = QosMatchingSubscription(
+                node, CameraInfo, info_topic or camera_info_topic(image_topic), 1, self._on_info)
+            self.name = self._subscription.topic
 
     def wait(self, seconds: float) -> None:
-        """Wait so long at most for the first CameraInfo where one is to come.
+        """Wait up to `seconds` for the first CameraInfo of a topic that has publishers.
 
-        It may overtake, or be overtaken by, the image it was sent with.
+        It may arrive before or after the image it was sent with.
         """
-        if self._following is not None and self._following.reliability != WAITING:
-            self._came.wait(seconds)
+        if self._subscription is not None and self._subscription.reliability is not None:
+            self._received.wait(seconds)
 
     def camera(self, width: int, height: int) -> Camera | None:
         """Return the camera of images of this size, None before there is a calibration.
 
-        Raises KfvoError when the calibration cannot be that of such images.
+        A calibration of another size is scaled. Raises KfvoError when its aspect ratio differs.
         """
-        camera = self._fixed
+        camera = self._file_camera
         if self._info is not None:
             try:
                 camera = camera_from_info(self._info, self._rectified, width, height)
@@ -222,6 +211,12 @@ class CameraSource:
         return (f'{why}: publish a calibrated CameraInfo there (or set camera_info_topic), or set '
                 'camera_info_file to a camera_info.yaml')
 
-    def _keep(self, info: CameraInfo) -> None:
+    def _on_info(self, info: CameraInfo) -> None:
         self._info = info
-        self._came.set()
+        self._received.set()
+
+
+def _type_name(message_type: Any) -> str:
+    """Return a type's name, like sensor_msgs/msg/Image."""
+    package, folder, _ = message_type.__module__.split('.', 2)
+    return f'{package}/{folder}/{message_type.__name__}'

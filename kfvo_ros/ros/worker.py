@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A thread that works on the newest item, so that what comes in never waits for it."""
+"""Two threads: a worker on a bounded queue of newest items, and a reader that reads ahead."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ Item = TypeVar('Item')
 
 
 class Worker:
-    """Calls `work` with one item after the other; the oldest of more than `size` are dropped.
+    """Calls `work` with one item at a time; drops the oldest waiting items beyond `size`.
 
-    After `idle_s` without an item `idle` is called. The thread starts with `start`.
+    After `idle_s` without an item it calls `idle`. The thread starts with `start`.
     """
 
     def __init__(self, work: Callable[[Any], None], idle: Callable[[], None], size: int,
@@ -29,11 +29,11 @@ class Worker:
         self._thread = threading.Thread(target=self._run, name='odometry', daemon=True)
 
     def start(self) -> None:
-        """Begin to work."""
+        """Start the thread."""
         self._thread.start()
 
     def put(self, item: Any) -> int:
-        """Hand over an item; return how many older ones were dropped for it."""
+        """Queue an item; return the number of older ones dropped for it."""
         with self._changed:
             self._items.append(item)
             dropped = max(0, len(self._items) - self._size)
@@ -43,7 +43,7 @@ class Worker:
         return dropped
 
     def stop(self) -> None:
-        """Let the item that is worked on be finished, drop the others, and return."""
+        """Drop the waiting items and return once the item in work is finished."""
         with self._changed:
             self._stopping = True
             self._items.clear()
@@ -65,17 +65,17 @@ class Worker:
 
 
 class ReadAhead(Generic[Item]):
-    """Iterates over `items` in their order, a thread fetching them until `limit` is reached.
+    """Iterates over `items` in order while a thread fetches them until `limit` is reached.
 
-    `size_of` tells how much of `limit` an item takes; one more than fits is held. An error of
-    `items` is raised after the items before it. Leaving ``with`` ends the thread.
+    `size_of` returns an item's share of `limit`; one item beyond the limit may be held. An error
+    of `items` is raised after the items before it. Leaving ``with`` ends the thread.
     """
 
     def __init__(self, items: Iterator[Item], size_of: Callable[[Item], int], limit: int) -> None:
         self._items, self._size_of, self._limit = items, size_of, limit
         self._fetched: deque[Item] = deque()
         self._size = 0
-        self._ended = self._unwanted = False
+        self._ended = self._stopping = False
         self._error: BaseException | None = None
         self._changed = threading.Condition()
         self._thread = threading.Thread(target=self._fetch, name='read_ahead', daemon=True)
@@ -87,7 +87,7 @@ class ReadAhead(Generic[Item]):
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
                  traceback: TracebackType | None) -> None:
         with self._changed:
-            self._unwanted = True
+            self._stopping = True
             self._changed.notify()
         self._thread.join()
 
@@ -110,7 +110,7 @@ class ReadAhead(Generic[Item]):
             for item in self._items:
                 with self._changed:
                     self._changed.wait_for(self._has_room)
-                    if self._unwanted:
+                    if self._stopping:
                         break
                     self._fetched.append(item)
                     self._size += self._size_of(item)
@@ -122,4 +122,4 @@ class ReadAhead(Generic[Item]):
             self._changed.notify()
 
     def _has_room(self) -> bool:
-        return self._unwanted or self._size < self._limit
+        return self._stopping or self._size < self._limit

@@ -1,6 +1,12 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What every sequence is: an iterator of frames, with ground truth where there is one."""
+"""The contract of sequences: stamped frames of one camera, with optional ground truth.
+
+To add a dataset, write a module with a function that opens a folder and a `SequenceKind` named
+``KIND``, and list the module in `kfvo_ros.sequences`. A dataset of image files returns an
+`image_folder.ImageListSequence`; other sources subclass `Sequence`. See ``tum.py`` for a short
+example.
+"""
 
 from __future__ import annotations
 
@@ -19,6 +25,7 @@ from kfvo_ros.trajectory import Trajectory
 BODY_FRAME = 'body'
 """The rig that carries the camera, where the source does not name it."""
 CALIBRATION_FILE = 'camera_info.yaml'
+"""Name of a ROS calibration file that overrides the calibration of the sequence beside it."""
 _log = logging.getLogger(__name__)
 
 
@@ -26,7 +33,7 @@ _log = logging.getLogger(__name__)
 class Frame:
     """One image: ``stamp_ns``, ``image`` (H, W) or (H, W, 3) RGB uint8, and its camera.
 
-    ``camera`` is None where no calibration is known; backbones that need one refuse it.
+    ``camera`` is None without a calibration; backbones that need one raise KfvoError.
     """
 
     stamp_ns: int
@@ -36,10 +43,10 @@ class Frame:
 
 @dataclass(frozen=True)
 class GroundTruth:
-    """Measured poses of one point on the rig.
+    """Measured poses T_world_frame of one frame on the rig.
 
-    ``frame`` says whose: ``camera`` (moved to the optical frame, T_world_camera) or the name
-    of the body, marker or prism that was measured.
+    ``frame`` is ``camera`` for the optical frame, else the name of the measured body, marker or
+    prism, which no known transform connects to the camera.
     """
 
     trajectory: Trajectory
@@ -48,7 +55,7 @@ class GroundTruth:
 
 @dataclass(frozen=True)
 class FixedTransform:
-    """How one named frame is mounted on another: T_parent_child (4, 4)."""
+    """The pose of one frame on another that carries it: T_parent_child (4, 4)."""
 
     parent: str
     child: str
@@ -56,10 +63,10 @@ class FixedTransform:
 
 
 class Sequence(ABC):
-    """Frames of one camera in time order, read lazily; iterate as often as you like.
+    """Frames of one camera in time order, read lazily; every iteration starts at the first.
 
-    ``name`` is for people (``kitti/03``). ``camera`` may be None when nobody calibrated it.
-    ``topic`` and ``camera_frame`` are what ROS calls its raw images and their optical frame.
+    ``name`` is the display name (``kitti/03``). ``camera`` is None without a calibration.
+    ``topic`` and ``camera_frame`` are the ROS names of the raw images and their optical frame.
     """
 
     name: str
@@ -69,96 +76,81 @@ class Sequence(ABC):
 
     @abstractmethod
     def __iter__(self) -> Iterator[Frame]:
-        """Yield the frames; raises KfvoError at one that cannot be read."""
+        """Yield the frames, stamps strictly increasing; KfvoError at one that is unreadable."""
 
     @property
     @abstractmethod
     def length(self) -> int | None:
-        """Number of frames, None where only reading to the end would tell."""
+        """Number of frames, None where it is unknown before the last frame is read."""
 
     def ground_truth(self) -> GroundTruth | None:
-        """Return the measured trajectory, read at the call, or None where there is none."""
+        """Read and return the measured trajectory, None where there is none."""
         return None
 
     def extrinsics(self) -> tuple[FixedTransform, ...]:
-        """Return what carries the camera: none, or transforms from the body to camera_frame."""
+        """Read and return the transforms from the body to camera_frame, empty if unknown."""
         return ()
 
 
 @dataclass(frozen=True)
 class SequenceSettings:
-    """What a user may say about a sequence; a kind ignores what does not concern it."""
+    """User settings of a sequence; each kind ignores those that do not apply to it."""
 
     camera: Camera | None = None
-    """Wins over every calibration that comes with the sequence."""
+    """Overrides every calibration that comes with the sequence."""
 
     image_topic: str | None = None
-    """Which images of a bag."""
+    """Image topic of a bag."""
 
     ground_truth_topic: str | None = None
-    """Which measured trajectory of a bag."""
+    """Ground truth topic of a bag."""
 
     ground_truth_to_camera: np.ndarray | None = None
-    """T_body_camera (4, 4), body being what the bag's ground truth measured."""
+    """T_body_camera (4, 4), where body is the frame of the bag's ground truth."""
 
     rate: float = 10.0
-    """Frames per second [Hz] where nothing else gives stamps."""
+    """Frames per second [Hz] of sources without stamps."""
 
 
 @dataclass(frozen=True)
 class SequenceKind:
-    """One kind of sequence: how it looks, for people and for code, and how to open it."""
+    """One kind of sequence: its description for users, how to detect it and how to open it."""
 
     name: str
-    looks_like: str
+    description: str
     matches: Callable[[Path], bool]
     open: Callable[[Path, SequenceSettings], Sequence]
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """Where the camera of a sequence may come from, in order of precedence.
+    """Sources of a sequence's camera, in order of precedence.
 
-    ``given`` by the user; CALIBRATION_FILE in ``folder``; ``own(width, height)``, what the
-    dataset itself says, asked only when the first two are absent.
+    First ``override``, the user's camera; then CALIBRATION_FILE in ``folder``; then
+    ``from_dataset(width, height)``, which is called only without the first two; last a guess.
     """
 
-    given: Camera | None
+    override: Camera | None
     folder: Path
-    own: Callable[[int, int], Camera | None] = lambda width, height: None
+    from_dataset: Callable[[int, int], Camera | None] = lambda width, height: None
 
     def camera(self, name: str, width: int, height: int) -> Camera:
         """Return the camera of images of this size; a guess is logged as a warning.
 
-        Raises KfvoError naming the sequence when a calibration is broken or of another shape.
+        Raises KfvoError naming the sequence when a calibration is broken or of another aspect
+        ratio.
         """
-        beside = self.folder / CALIBRATION_FILE
-        if self.given is not None:
-            camera = self.given
-        elif beside.is_file():
-            camera = read_camera_info(beside)
+        path = self.folder / CALIBRATION_FILE
+        if self.override is not None:
+            camera = self.override
+        elif path.is_file():
+            camera = read_camera_info(path)
         else:
-            camera = self.own(width, height) or _guess(name, width, height)
+            camera = self.from_dataset(width, height) or _guess(name, width, height)
         try:
             return camera.scaled(width, height)
         except KfvoError as error:
             raise KfvoError(f'{name}: {error}') from error
-
-
-def rigid_transform(numbers: object, what: str) -> np.ndarray:
-    """Return T (4, 4) of 16 numbers in rows; KfvoError when they are no rigid transform."""
-    try:
-        transform = np.array(numbers, dtype=np.float64).reshape(4, 4)
-    except (TypeError, ValueError):
-        transform = np.zeros((4, 4))
-    rotation = transform[:3, :3]
-    if not (np.isfinite(transform).all() and np.allclose(transform[3], (0, 0, 0, 1))
-            and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
-            and np.linalg.det(rotation) > 0):
-        found = ' '.join(str(numbers).split())
-        raise KfvoError(f'{what}: expected a rigid 4x4 transform (a rotation, a translation, and '
-                        f'0 0 0 1 below), found {found[:200]}')
-    return transform
 
 
 def _guess(name: str, width: int, height: int) -> Camera:

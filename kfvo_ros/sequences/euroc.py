@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""EuRoC MAV in the ASL layout: mav0/cam0 with data.csv and sensor.yaml.
+"""EuRoC MAV dataset in the ASL layout: mav0/cam0 with data.csv and sensor.yaml.
 
 Source: Burri et al., "The EuRoC micro aerial vehicle datasets", IJRR 2016.
 """
@@ -21,20 +21,19 @@ from kfvo_ros.sequences.base import (
     GroundTruth,
     SequenceKind,
     SequenceSettings,
-    rigid_transform,
 )
 from kfvo_ros.sequences.image_folder import ImageListSequence
 from kfvo_ros.trajectory import Trajectory
 from kfvo_ros.utils.files import parse_pose, read_rows, read_yaml
 
 
-def open_euroc(path: Path, options: SequenceSettings) -> ImageListSequence:
+def open_euroc(path: Path, settings: SequenceSettings) -> ImageListSequence:
     """Open the left camera of a sequence; `path` is mav0 or its parent."""
     root = path / 'mav0' if (path / 'mav0').is_dir() else path
     folder = root.parent if root.name == 'mav0' else root
     sensor_file = root / 'cam0' / 'sensor.yaml'
     images = read_rows(root / 'cam0' / 'data.csv', 'timestamp [ns],filename', _parse_image)
-    calibration = Calibration(options.camera, folder, partial(_read_camera, sensor_file))
+    calibration = Calibration(settings.camera, folder, partial(_read_camera, sensor_file))
     return ImageListSequence(folder.name, root / 'cam0' / 'data', images, calibration,
                              partial(_read_ground_truth, root, sensor_file),
                              partial(_read_extrinsics, sensor_file))
@@ -75,28 +74,29 @@ def _read_camera(sensor_file: Path, width: int, height: int) -> Camera | None:
 
 
 def _read_ground_truth(root: Path, sensor_file: Path) -> GroundTruth | None:
-    """Read T_world_body, quaternion w first, and move it to the camera by the sensor's T_BS."""
+    """Return T_world_camera: the file's T_world_body (quaternion w first) times T_BS."""
     path = root / 'state_groundtruth_estimate0' / 'data.csv'
     if not path.is_file():
         return None
     rows = read_rows(path, 'timestamp [ns], p x y z, q w x y z, ...', _parse_pose)
     values = np.array([row for _, row in rows]).reshape(-1, 7)
-    body = Trajectory(np.array([stamp_ns for stamp_ns, _ in rows], dtype=np.int64),
-                      geometry.transform_from_xyz_quat(values[:, [0, 1, 2, 4, 5, 6, 3]]))
+    T_world_body = geometry.transform_from_xyz_quat(values[:, [0, 1, 2, 4, 5, 6, 3]])
+    trajectory = Trajectory(np.array([stamp_ns for stamp_ns, _ in rows], dtype=np.int64),
+                            T_world_body)
     T_body_camera = _read_extrinsics(sensor_file)
     if T_body_camera is None:
         raise KfvoError(f'{sensor_file}: expected T_BS with 16 numbers under data')
-    return GroundTruth(body.moved(T_body_camera))
+    return GroundTruth(trajectory.right_multiplied(T_body_camera))
 
 
 def _read_extrinsics(sensor_file: Path) -> np.ndarray | None:
-    """Read T_BS, which is T_body_camera, None where there is none."""
+    """Return T_body_camera, which EuRoC names T_BS, None where there is none."""
     if not sensor_file.is_file():
         return None
     extrinsics = _read_sensor(sensor_file).get('T_BS')
     if not isinstance(extrinsics, dict):
         return None
-    return rigid_transform(extrinsics.get('data'), f'{sensor_file}, T_BS')
+    return geometry.as_rigid_transform(extrinsics.get('data'), f'{sensor_file}, T_BS')
 
 
 def _parse_pose(line: str) -> tuple[int, list[float]]:

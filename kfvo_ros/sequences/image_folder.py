@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Image files with stamps: what most datasets are once their index is read."""
+"""Sequences of stamped image files: the base of most datasets, and plain folders."""
 
 from __future__ import annotations
 
@@ -36,8 +36,10 @@ _log = logging.getLogger(__name__)
 class ImageListSequence(Sequence):
     """Stamped image files of one folder, decoded one at a time.
 
-    `images` are (stamp_ns, file name); a stamp that does not come after the one before it is
-    left out with a warning. The first image is read at once: its size decides the camera.
+    `images` are (stamp_ns, file name); images whose stamp does not increase are dropped with a
+    warning. `ground_truth` and `T_body_camera` are read at the call of `ground_truth` and
+    `extrinsics`. The first image is read at construction, because the camera depends on its
+    size. Raises KfvoError without images, and for a first image or calibration that is broken.
     """
 
     camera: Camera
@@ -48,7 +50,7 @@ class ImageListSequence(Sequence):
                  T_body_camera: Callable[[], np.ndarray | None] = lambda: None) -> None:
         self.name = name
         self._folder = folder
-        self._images = _in_time_order(name, images)
+        self._images = _with_increasing_stamps(name, images)
         self._read_ground_truth = ground_truth
         self._read_T_body_camera = T_body_camera
         if not self._images:
@@ -57,7 +59,7 @@ class ImageListSequence(Sequence):
         self.camera = calibration.camera(name, width, height)
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yield the frames; KfvoError naming a file that is missing, broken or of other size."""
+        """Yield the frames; raises KfvoError for a missing, broken or differently sized file."""
         size = (self.camera.width, self.camera.height)
         for stamp_ns, file_name in self._images:
             path = self._folder / file_name
@@ -73,18 +75,18 @@ class ImageListSequence(Sequence):
         return len(self._images)
 
     def ground_truth(self) -> GroundTruth | None:
-        """Return the measured trajectory, read at the call, or None where there is none."""
+        """Read and return the measured trajectory, None where there is none."""
         return self._read_ground_truth()
 
     def extrinsics(self) -> tuple[FixedTransform, ...]:
-        """Return where the camera is on the body, read at the call, where the dataset says it."""
+        """Read and return the transform from the body to the camera, empty if unknown."""
         T_body_camera = self._read_T_body_camera()
         return () if T_body_camera is None else (
             FixedTransform(BODY_FRAME, self.camera_frame, T_body_camera),)
 
 
 def list_images(folder: Path) -> list[str]:
-    """Return the names of the image files of a folder, 9.png before 10.png."""
+    """Return the names of a folder's image files in natural order: 9.png before 10.png."""
     try:
         names = [path.name for path in folder.iterdir()
                  if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith('.')]
@@ -94,9 +96,10 @@ def list_images(folder: Path) -> list[str]:
 
 
 def stamps_at_rate(rate: float) -> Callable[[int], int]:
-    """Return stamp_ns of frame 0, 1, 2 ... at `rate` [Hz], in integers.
+    """Return the function from frame index to stamp_ns at `rate` [Hz], in integer arithmetic.
 
-    The rate is taken as the simple fraction it means: 29.97003 is 30000/1001.
+    The rate becomes the nearest simple fraction (29.97003 is 30000/1001), so stamps do not
+    drift. Raises KfvoError for a rate that is not positive and finite.
     """
     fraction = Fraction(rate).limit_denominator(1_000_000) if math.isfinite(rate) else Fraction(0)
     if fraction <= 0:
@@ -104,14 +107,29 @@ def stamps_at_rate(rate: float) -> Callable[[int], int]:
     return lambda index: index * NANOSECONDS * fraction.denominator // fraction.numerator
 
 
+def open_folder(path: Path, settings: SequenceSettings) -> ImageListSequence:
+    """Open the images of a folder, stamped at the rate of the settings."""
+    stamp_at = stamps_at_rate(settings.rate)
+    images = [(stamp_at(index), name) for index, name in enumerate(list_images(path))]
+    return ImageListSequence(path.name, path, images, Calibration(settings.camera, path))
+
+
+def _matches(path: Path) -> bool:
+    return path.is_dir() and bool(list_images(path))
+
+
+KIND = SequenceKind('folder', 'a folder of images', _matches, open_folder)
+
+
 def _natural_order(name: str) -> list[tuple[int, str]]:
-    """Return a sort key that compares runs of digits as numbers."""
+    """Return a sort key in which runs of digits compare as numbers."""
     return [(int(part), '') if part.isdigit() and part.isascii() else (-1, part)
             for part in re.split(r'([0-9]+)', name)]
 
 
-def _in_time_order(name: str, images: Iterable[tuple[int, str]]) -> list[tuple[int, str]]:
-    """Drop images whose stamp does not come after the one before, and say how many."""
+def _with_increasing_stamps(name: str, images: Iterable[tuple[int, str]]
+                            ) -> list[tuple[int, str]]:
+    """Return the images without those whose stamp does not increase; log their number."""
     kept: list[tuple[int, str]] = []
     dropped = 0
     for stamp_ns, file_name in images:
@@ -124,12 +142,3 @@ def _in_time_order(name: str, images: Iterable[tuple[int, str]]) -> list[tuple[i
     return kept
 
 
-def open_folder(path: Path, options: SequenceSettings) -> ImageListSequence:
-    """Open the images of a folder, stamped at the rate of the options."""
-    stamp_of = stamps_at_rate(options.rate)
-    images = [(stamp_of(index), name) for index, name in enumerate(list_images(path))]
-    return ImageListSequence(path.name, path, images, Calibration(options.camera, path))
-
-
-KIND = SequenceKind('folder', 'a folder of images', lambda path: path.is_dir() and bool(list_images(path)),
-                    open_folder)

@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""TartanAir V1: .../P000 with image_left and pose_left.txt.
+"""TartanAir V1 dataset: .../P000 with image_left and pose_left.txt.
 
 Source: Wang et al., "TartanAir: a dataset to push the limits of visual SLAM", IROS 2020, and
 the data page of tartanair_tools.
@@ -22,19 +22,19 @@ from kfvo_ros.trajectory import Trajectory
 from kfvo_ros.utils.files import parse_pose, read_rows
 
 CAMERA = Camera(640, 480, 320.0, 320.0, 320.0, 240.0)
-"""The one camera of the whole dataset."""
+"""The camera of all sequences."""
 R_NED_OPTICAL = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-"""The dataset's camera looks along x with z down; an optical frame along z with y down."""
+"""The dataset's camera frame has x forward and z down, an optical frame z forward and y down."""
 
 
-def open_tartanair(path: Path, options: SequenceSettings) -> ImageListSequence:
-    """Open the left camera of a trajectory folder, stamped at the rate of the options."""
+def open_tartanair(path: Path, settings: SequenceSettings) -> ImageListSequence:
+    """Open the left camera of a trajectory folder, stamped at the rate of the settings."""
     folder = path / 'image_left'
-    stamp_of = stamps_at_rate(options.rate)
-    images = [(stamp_of(index), name) for index, name in enumerate(list_images(folder))]
+    stamp_at = stamps_at_rate(settings.rate)
+    images = [(stamp_at(index), name) for index, name in enumerate(list_images(folder))]
     stamps_ns = np.array([stamp_ns for stamp_ns, _ in images], dtype=np.int64)
     return ImageListSequence('/'.join(path.parts[-3:]), folder, images,
-                             Calibration(options.camera, path, lambda width, height: CAMERA),
+                             Calibration(settings.camera, path, lambda width, height: CAMERA),
                              partial(_read_ground_truth, path / 'pose_left.txt', stamps_ns))
 
 
@@ -42,12 +42,12 @@ def _matches(path: Path) -> bool:
     return (path / 'image_left').is_dir() and (path / 'pose_left.txt').is_file()
 
 
-KIND = SequenceKind('tartanair', 'TartanAir V1: .../P000 with image_left and pose_left.txt', _matches,
-                    open_tartanair)
+KIND = SequenceKind('tartanair', 'TartanAir V1: .../P000 with image_left and pose_left.txt',
+                    _matches, open_tartanair)
 
 
 def _read_ground_truth(path: Path, stamps_ns: np.ndarray) -> GroundTruth | None:
-    """Read poses of the NED camera and turn them to optical axes; the world stays NED."""
+    """Return T_world_camera with optical axes; the world frame stays NED."""
     if not path.is_file():
         return None
     rows = read_rows(path, 'tx ty tz qx qy qz qw', lambda line: parse_pose(line.split()))

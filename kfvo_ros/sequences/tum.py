@@ -1,9 +1,9 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""TUM RGB-D: rgb.txt beside the images, groundtruth.txt, intrinsics by the Kinect that was used.
+"""TUM RGB-D dataset: rgb.txt, groundtruth.txt, and intrinsics by the folder's name.
 
 Source: Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012;
-intrinsics of the dataset's page on calibration.
+intrinsics from the calibration page of the dataset.
 """
 
 from __future__ import annotations
@@ -19,9 +19,8 @@ from kfvo_ros.trajectory import parse_stamp_ns, read_tum
 from kfvo_ros.utils.files import read_rows
 
 KINECT_READOUT = 0.030
-"""The colour sensor is read row by row over nearly the whole interval of 33 ms (Ringaby and
-Forssen, "Scan rectification for structured light range sensors with rolling shutters", ICCV
-2011)."""
+"""Readout time [s]: nearly the whole frame interval of 33 ms (Ringaby and Forssen,
+"Scan rectification for structured light range sensors with rolling shutters", ICCV 2011)."""
 FREIBURG = {
     '1': Camera(640, 480, 517.306408, 516.469215, 318.643040, 255.313989, 'plumb_bob',
                 (0.262383, -0.953104, -0.005358, 0.002628, 1.163314), readout_s=KINECT_READOUT),
@@ -29,19 +28,19 @@ FREIBURG = {
                 (0.231222, -0.784899, -0.003257, -0.000105, 0.917205), readout_s=KINECT_READOUT),
     '3': Camera(640, 480, 535.4, 539.2, 320.1, 247.6, readout_s=KINECT_READOUT),
 }
-"""The colour cameras of freiburg1, 2 and 3; the third's images are rectified."""
+"""The colour cameras of freiburg1, 2 and 3; the images of freiburg3 are rectified."""
 
 
-def open_tum(path: Path, options: SequenceSettings) -> ImageListSequence:
+def open_tum(path: Path, settings: SequenceSettings) -> ImageListSequence:
     """Open the colour camera of a sequence folder."""
     images = read_rows(path / 'rgb.txt', 'timestamp filename', _parse_image)
     return ImageListSequence(path.name, path, images,
-                             Calibration(options.camera, path, partial(_camera_of, path.name)),
+                             Calibration(settings.camera, path, partial(_camera_of, path.name)),
                              partial(_read_ground_truth, path / 'groundtruth.txt'))
 
 
-KIND = SequenceKind('tum', 'TUM RGB-D: a folder with rgb.txt', lambda path: (path / 'rgb.txt').is_file(),
-                    open_tum)
+KIND = SequenceKind('tum', 'TUM RGB-D: a folder with rgb.txt',
+                    lambda path: (path / 'rgb.txt').is_file(), open_tum)
 
 
 def _parse_image(line: str) -> tuple[int, str]:
@@ -50,10 +49,10 @@ def _parse_image(line: str) -> tuple[int, str]:
 
 
 def _camera_of(name: str, width: int, height: int) -> Camera | None:
-    found = re.search(r'(?:^|_)(?:freiburg|fr)([123])(?:_|$)', name)
-    return FREIBURG[found[1]] if found else None
+    match = re.search(r'(?:^|_)(?:freiburg|fr)([123])(?:_|$)', name)
+    return FREIBURG[match[1]] if match else None
 
 
 def _read_ground_truth(path: Path) -> GroundTruth | None:
-    """Read the poses of the colour camera's optical frame, which is what the file holds."""
+    """Return the file's poses, which are those of the colour camera's optical frame."""
     return GroundTruth(read_tum(path)) if path.is_file() else None

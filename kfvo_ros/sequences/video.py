@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A video file, calibrated by a camera_info.yaml beside it."""
+"""Video files, calibrated by a camera_info.yaml beside them."""
 
 from __future__ import annotations
 
@@ -18,49 +18,54 @@ VIDEO_SUFFIXES = frozenset(('.mp4', '.m4v', '.avi', '.mov', '.mkv', '.webm', '.m
 
 
 class VideoSequence(Sequence):
-    """The frames of a video, stamped from zero at the rate that its container states.
+    """The frames of a video file, stamped from zero at the frame rate of its container.
 
-    Where it states none, `rate` [Hz] holds. `length` is the container's word, not a count.
+    `rate` [Hz] is used where the container states none. `length` is read from the container and
+    may be wrong. Raises KfvoError for a video that OpenCV cannot decode.
     """
 
     def __init__(self, path: Path, calibration: Calibration, rate: float) -> None:
         self.name = path.stem
         self._path = path
-        with _opened(path) as capture:
+        with _capture(path) as capture:
             self._length = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
-            stated_rate = capture.get(cv2.CAP_PROP_FPS)
+            container_rate = capture.get(cv2.CAP_PROP_FPS)
             readable, image = capture.read()
         if not readable:
             raise KfvoError(f'{path}: expected a video, not one frame of it can be decoded')
-        self._stamp_of = stamps_at_rate(stated_rate if stated_rate > 0 else rate)
+        self._stamp_at = stamps_at_rate(container_rate if container_rate > 0 else rate)
         self.camera = calibration.camera(self.name, image.shape[1], image.shape[0])
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yield the frames up to the first that cannot be decoded: that is how videos end."""
-        with _opened(self._path) as capture:
+        """Yield the frames up to the first that cannot be decoded, OpenCV's sign of the end."""
+        with _capture(self._path) as capture:
             index = 0
             while (read := capture.read())[0]:
                 image = cv2.cvtColor(read[1], cv2.COLOR_BGR2RGB)
-                yield Frame(self._stamp_of(index), image, self.camera)
+                yield Frame(self._stamp_at(index), image, self.camera)
                 index += 1
 
     @property
     def length(self) -> int | None:
-        """Number of frames as the container states it, None where it does not."""
+        """Number of frames by the container, None where it states none."""
         return self._length if self._length > 0 else None
 
 
-def open_video(path: Path, options: SequenceSettings) -> VideoSequence:
+def open_video(path: Path, settings: SequenceSettings) -> VideoSequence:
     """Open a video file."""
-    return VideoSequence(path, Calibration(options.camera, path.parent), options.rate)
+    return VideoSequence(path, Calibration(settings.camera, path.parent), settings.rate)
 
 
-KIND = SequenceKind('video', f'a video file ({" ".join(sorted(VIDEO_SUFFIXES))})',
-                    lambda path: path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES, open_video)
+def _matches(path: Path) -> bool:
+    return path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES
+
+
+KIND = SequenceKind('video', f'a video file ({" ".join(sorted(VIDEO_SUFFIXES))})', _matches,
+                    open_video)
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[cv2.VideoCapture]:
+def _capture(path: Path) -> Iterator[cv2.VideoCapture]:
     capture = cv2.VideoCapture(str(path))
     try:
         if not capture.isOpened():

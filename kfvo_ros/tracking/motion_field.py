@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""How the whole image moves between two frames: smooth enough to be known between the tracks."""
+"""Smooth motion field of an image: a polynomial fitted to tracks, evaluated at any pixel."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from dataclasses import dataclass
 import numpy as np
 
 MIN_TRACKS = 24
-"""With fewer tracks there is no field."""
+"""Fewer tracks determine no field."""
 KEPT_SHARE = 0.8
-"""The field is fitted once more without the tracks that agree least."""
+"""Share of the tracks, those with the smallest residuals, that the second fit uses."""
 
 
 @dataclass(frozen=True)
 class MotionField:
-    """Polynomials of second order in the image: the flow of a rotation is one of them.
+    """Second-order polynomials in x and y, which hold the flow of a small rotation exactly.
 
-    ``coefficients`` (6, 2) give motion in the unit of what was fitted, ``size`` (2,) is the
-    image's width and height [px].
+    ``coefficients`` (6, 2) in the unit of the fitted motion; ``size`` (2,) is the image's width
+    and height [px].
     """
 
     coefficients: np.ndarray
@@ -31,7 +31,7 @@ class MotionField:
 
 
 def fit(pixels: np.ndarray, motion: np.ndarray, size: np.ndarray) -> MotionField | None:
-    """Return the field nearest to the `motion` (N, 2) of `pixels` (N, 2), None for too few."""
+    """Fit a field to the `motion` (N, 2) of `pixels` (N, 2); None with too few of them."""
     if len(pixels) < MIN_TRACKS:
         return None
     monomials = _monomials(pixels, size)

@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Sequences as they might have been recorded: another light, pace, direction or calibration."""
+"""Augmentation of sequences: light, frame rate, direction and calibration."""
 
 from __future__ import annotations
 
@@ -17,13 +17,14 @@ from kfvo_ros.sequences.base import Frame, GroundTruth, Sequence
 
 @dataclass(frozen=True)
 class Augmentation:
-    """How far variants of a sequence may go from it.
+    """Ranges of the random variants of a sequence.
 
-    ``brightness``, ``contrast`` and ``saturation`` of a variant are factors within 1 +- these;
-    its focal length and its lens are believed to be off by up to ``calibration``; a frame is left
-    out with a probability of up to ``drop_share``; of the others every k-th is taken, k up to
-    ``max_stride``, and with ``reversal`` one variant in two runs backwards. A variant has
-    ``frames`` at most, from anywhere. Source, but for the calibration: the paper, section IV-E.
+    ``brightness``, ``contrast`` and ``saturation`` are factors within 1 +- these; the calibrated
+    focal length and first distortion coefficient are wrong by up to ``calibration``; every k-th
+    frame is used, k up to ``max_stride``, and of these each is dropped with a probability of up
+    to ``drop_share``; with ``reversal`` half of the variants run backwards. A variant has at most
+    ``frames`` frames, from a random start. Source, except for the calibration: the paper, section
+    IV-E.
     """
 
     brightness: float = 0.4
@@ -37,7 +38,7 @@ class Augmentation:
 
 
 class SequenceVariant(Sequence):
-    """One variant of a sequence, of its first `stop` frames: the same number, the same variant."""
+    """Variant of the first `stop` frames of a sequence, reproducible by its `number`."""
 
     def __init__(self, sequence: Sequence, augmentation: Augmentation, number: int,
                  stop: int | None = None) -> None:
@@ -55,40 +56,40 @@ class SequenceVariant(Sequence):
         length = sequence.length or 0 if stop is None else min(stop, sequence.length or stop)
         spare = length - augmentation.frames * self._stride
         self._start = int(rng.integers(0, max(spare, 0), endpoint=True))
-        # What a rolling shutter did cannot be read backwards.
+        # The rows of a rolling shutter are not exposed in reverse.
         rolling = sequence.camera is not None and sequence.camera.readout_s > 0.0
         self._backwards = augmentation.reversal and not rolling and bool(rng.integers(2))
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yield the frames; of a variant that runs backwards all images are held."""
+        """Yield the frames; a backwards variant holds all images in memory."""
         rng = np.random.default_rng((*self._rng_seed, 1))
-        seen = islice(self._sequence, self._start, self._stop, self._stride)
+        strided = islice(self._sequence, self._start, self._stop, self._stride)
         frames: Iterator[Frame] = islice(
-            (frame for frame in seen if rng.random() >= self._drop_share), self._frames)
+            (frame for frame in strided if rng.random() >= self._drop_share), self._frames)
         if self._backwards:
-            mirror = self._mirror_ns()
-            frames = (replace(frame, stamp_ns=mirror - frame.stamp_ns)
+            stamp_sum_ns = self._stamp_sum_ns()
+            frames = (replace(frame, stamp_ns=stamp_sum_ns - frame.stamp_ns)
                       for frame in reversed(list(frames)))
         for frame in frames:
             yield replace(frame, image=jitter(frame.image, *self._factors), camera=self.camera)
 
     @property
     def length(self) -> None:
-        """Nobody knows before."""
+        """None: the number of frames is not known in advance."""
         return None
 
     def ground_truth(self) -> GroundTruth | None:
-        """Return the sequence's, backwards where the frames are."""
+        """Return the ground truth of the sequence, reversed where the frames are."""
         truth = self._sequence.ground_truth()
         if truth is None or not self._backwards:
             return truth
-        there = truth.trajectory
-        back = replace(there, stamps_ns=self._mirror_ns() - there.stamps_ns[::-1],
-                       poses=there.poses[::-1])
-        return replace(truth, trajectory=back)
+        forward = truth.trajectory
+        backward = replace(forward, stamps_ns=self._stamp_sum_ns() - forward.stamps_ns[::-1],
+                           poses=forward.poses[::-1])
+        return replace(truth, trajectory=backward)
 
-    def _mirror_ns(self) -> int:
-        """Return the sum of a stamp and the one it becomes."""
+    def _stamp_sum_ns(self) -> int:
+        """Return the sum of a stamp and its mirrored stamp."""
         truth = self._sequence.ground_truth()
         if truth is None or not len(truth.trajectory.stamps_ns):
             return 0
@@ -97,7 +98,7 @@ class SequenceVariant(Sequence):
 
 def jitter(image: np.ndarray, brightness: float, contrast: float,
            saturation: float) -> np.ndarray:
-    """Return the image (H, W) or (H, W, 3) RGB uint8 under another light; 1 changes nothing."""
+    """Return the colour-jittered image (H, W) or (H, W, 3) RGB uint8; a factor of 1 is neutral."""
     picture = Image.fromarray(image)
     for enhance, factor in ((ImageEnhance.Brightness, brightness),
                             (ImageEnhance.Contrast, contrast), (ImageEnhance.Color, saturation)):

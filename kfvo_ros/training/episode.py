@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""One sequence as a Markov decision process: keep the frame, or drop it (paper, section IV-A)."""
+"""One sequence as a Markov decision process: keep a frame or drop it (paper, section IV-A)."""
 
 from __future__ import annotations
 
@@ -13,116 +13,129 @@ from kfvo_ros.backbones.base import Backbone, Encoded, Estimate, Stream, Window
 from kfvo_ros.keyframes.base import DecisionInput
 from kfvo_ros.keyframes.guard import KeyframeGuard
 from kfvo_ros.keyframes.heuristics import EveryFrame
-from kfvo_ros.odometry.keyframe_odometry import FramePose, KeyframeOdometry
+from kfvo_ros.odometry.keyframe_odometry import KeyframeOdometry
+from kfvo_ros.odometry.updates import FramePose
 from kfvo_ros.sequences.base import Frame
 from kfvo_ros.training.encoded_sequence import EncodedSequence
 from kfvo_ros.training.rewards import STANDSTILL_M, Reward
 
-AHEAD = 2
-"""So many true motions to come are told to the critic."""
-POSE = 7
-PRIVILEGED_SIZE = (1 + AHEAD) * POSE + 2
+LOOKAHEAD = 2
+"""True motions after the newest frame that the critic sees."""
+POSE_SIZE = 7
+PRIVILEGED_SIZE = (1 + LOOKAHEAD) * POSE_SIZE + 2
 
 
 class Episode:
-    """Drives through a sequence, and stops where there is something to decide.
+    """Runs the odometry over a sequence and stops at every decision of the policy.
 
-    ``decision`` is what the policy sees there, None before the first one and once it ``ended``:
-    at the last frame, or when the camera is lost. Where the rail decides nobody is asked, and
-    before anybody was ``asked`` nothing is earned. The caller runs the backbone: encode what is
-    `unseen`, `enter`, estimate the window, `leave`, until there is a decision.
+    ``decision`` is the policy's input at such a stop; it is None before the first one and once
+    the episode ``ended``, at the last frame or with a lost camera. Decisions that the guard
+    forces are not the policy's: their reward adds to that of the decision before, and counts
+    for nothing until the episode ``reached_decision``. The caller runs the backbone: encode
+    `unencoded_frame`, `begin`, estimate the window, `integrate`, until there is a decision.
     """
 
-    def __init__(self, drive: EncodedSequence, backbone: Backbone, scale_rule: str, window_size: int,
-                 rail: KeyframeGuard, reward: Reward) -> None:
-        self._drive, self._rail, self._reward = drive, rail, reward
+    def __init__(self, sequence: EncodedSequence, backbone: Backbone, scale_rule: str,
+                 window_size: int, guard: KeyframeGuard, reward: Reward) -> None:
+        self._sequence, self._guard, self._reward = sequence, guard, reward
         self._odometry = KeyframeOdometry(backbone, EveryFrame(), scale_rule, window_size,
                                           with_covariance=False)
-        self._trail: deque[FramePose] = deque(maxlen=reward.span or 0)
-        self._next = 0
+        self._latest_frames: deque[FramePose] = deque(maxlen=reward.span or 0)
+        self._next_index = 0
         self.decision: DecisionInput | None = None
         self.ended = False
-        self.asked = False
-        self._earned = 0.0
+        self.reached_decision = False
+        self._pending_reward = 0.0
 
-    def unseen(self) -> tuple[Stream, Frame] | None:
-        """Return the next frame, and its stream, where it has to be encoded first."""
-        if self._drive.encoded[self._next] is not None:
+    def unencoded_frame(self) -> tuple[Stream, Frame] | None:
+        """Return the next frame and its stream, None for a frame that is encoded already."""
+        if self._sequence.encoded[self._next_index] is not None:
             return None
-        frame = self._drive.frames[self._next]
+        frame = self._sequence.frames[self._next_index]
         return self._odometry.open(frame.camera), frame
 
-    def enter(self, encoded: Encoded | None = None) -> Window | None:
-        """Take in the next frame; return the window to estimate, None for the very first."""
-        index, self._next = self._next, self._next + 1
-        return self._odometry.begin(self._drive.frames[index],
-                                    encoded or self._drive.encoded[index])
+    def begin(self, encoded: Encoded | None = None) -> Window | None:
+        """Take in the next frame; return the window to estimate, None for the first frame."""
+        index, self._next_index = self._next_index, self._next_index + 1
+        return self._odometry.encode(self._sequence.frames[index],
+                                     encoded or self._sequence.encoded[index])
 
-    def leave(self, estimate: Estimate | None) -> None:
-        """Go on to a decision where there is one, else decide as the odometry or the rail does."""
-        decision = self._odometry.integrate(estimate)
-        if isinstance(decision, bool):
-            self._commit(decision)
-            self.ended = not decision or self._next == len(self._drive)
+    def integrate(self, estimate: Estimate | None) -> None:
+        """Add the window's estimate; set ``decision``, or decide as odometry or guard force."""
+        step = self._odometry.integrate(estimate)
+        if step.decision is None:
+            self._commit(step.keep)
+            self.ended = not step.keep or self._at_end
             return
-        forced = self._rail.forced(decision)
+        forced = self._guard.forced(step.decision)
         if forced is None:
-            self.decision, self.asked = decision, True
+            self.decision, self.reached_decision = step.decision, True
         else:
             self.decide(forced)
 
     def decide(self, keep: bool) -> None:
-        """Keep or drop the frame, and earn what that is worth."""
-        window = self._window() if self._reward.span is None else None
-        self._commit(keep)
-        worth = self._reward(*(window or self._recent()), keep)
-        self._earned += worth if self.asked else 0.0
+        """Keep or drop the newest frame, and add the reward of this decision."""
+        if self._reward.span is None:  # of the window that the decision was made on
+            estimated, true = self._window_poses()
+            self._commit(keep)
+        else:
+            self._commit(keep)
+            estimated, true = self._latest_poses()
+        reward = self._reward(estimated, true, keep)
+        if self.reached_decision:
+            self._pending_reward += reward
         self.decision = None
-        self.ended = self._next == len(self._drive)
+        self.ended = self._at_end
 
-    def take_reward(self) -> float:
-        """Return what was earned since it was taken last: a decision's worth, and the rail's."""
-        earned, self._earned = self._earned, 0.0
-        return earned
+    def pop_reward(self) -> float:
+        """Return the reward since the last call: the policy's decision and forced ones."""
+        reward, self._pending_reward = self._pending_reward, 0.0
+        return reward
 
-    def privileged(self) -> np.ndarray:
-        """Return what only the critic sees (PRIVILEGED_SIZE,): the true motion, and the next.
+    def privileged_observation(self) -> np.ndarray:
+        """Return the critic's additional input (PRIVILEGED_SIZE,), float32.
 
-        From the last keyframe to the newest frame, then frame by frame, in the trajectory's unit,
-        each (t, quat_xyzw); past the end zeros, and a flag of 1. At last how good the trajectory
-        is so far: one that is bad already has less to lose.
+        True motions, each (t, quat_xyzw) in trajectory units: T_newest_keyframe of the last
+        keyframe, then LOOKAHEAD motions from frame to frame; past the end of the sequence zeros
+        and a flag of 1. The last number is the trajectory's quality (`Reward.quality`): a bad
+        trajectory has less to lose.
         """
-        estimated, true = self._window()
+        estimated, true = self._window_poses()
         unit_m = _metres_per_unit(estimated[:, :3, 3], true[:, :3, 3])
-        ahead = self._drive.T_truth_camera[self._next - 1:self._next + AHEAD]
+        ahead = self._sequence.T_truth_camera[self._next_index - 1:self._next_index + LOOKAHEAD]
         motions = np.concatenate([geometry.relative(true[-1:], true[-2:-1]),
                                   geometry.relative(ahead[:-1], ahead[1:])])
-        told = np.zeros((1 + AHEAD, POSE), dtype=np.float32)
-        told[:len(motions), :3] = motions[:, :3, 3] / unit_m
-        told[:len(motions), 3:] = geometry.quat_xyzw_from_rotation(motions[:, :3, :3])
-        return np.append(told, [np.float32(len(motions) < len(told)),
-                                np.float32(self._reward.standing)])
+        numbers = np.zeros((1 + LOOKAHEAD, POSE_SIZE), dtype=np.float32)
+        numbers[:len(motions), :3] = motions[:, :3, 3] / unit_m
+        numbers[:len(motions), 3:] = geometry.quat_xyzw_from_rotation(motions[:, :3, :3])
+        return np.append(numbers, [np.float32(len(motions) < len(numbers)),
+                                   np.float32(self._reward.quality)])
+
+    @property
+    def _at_end(self) -> bool:
+        return self._next_index == len(self._sequence)
 
     def _commit(self, keep: bool) -> None:
         self._odometry.commit(keep, {})
-        self._trail.append(self._odometry.pending[-1])
+        self._latest_frames.append(self._odometry.pending[-1])
 
-    def _window(self) -> tuple[np.ndarray, np.ndarray]:
+    def _window_poses(self) -> tuple[np.ndarray, np.ndarray]:
         """Return estimated and true poses (S, 4, 4) of the frames in the window."""
         window = self._odometry.window
         return (np.array([frame.T_world_camera for frame in window]),
-                self._drive.T_truth_camera[[frame.index for frame in window]])
+                self._sequence.T_truth_camera[[frame.index for frame in window]])
 
-    def _recent(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return estimated and true poses (S, 4, 4) of the last input frames, as known now."""
-        keyframes = np.concatenate([placed.keyframe.T_world_camera for placed in self._trail])
-        offsets = np.concatenate([placed.T_keyframe_camera for placed in self._trail])
+    def _latest_poses(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return present estimates and true poses (S, 4, 4) of the latest input frames."""
+        keyframes = np.concatenate([each.keyframe.T_world_camera for each in self._latest_frames])
+        offsets = np.concatenate([each.T_keyframe_camera for each in self._latest_frames])
+        first = self._next_index - len(self._latest_frames)
         return (keyframes.reshape(-1, 4, 4) @ offsets.reshape(-1, 4, 4),
-                self._drive.T_truth_camera[self._next - len(self._trail):self._next])
+                self._sequence.T_truth_camera[first:self._next_index])
 
 
 def _metres_per_unit(estimated: np.ndarray, true: np.ndarray) -> float:
-    """Return how much wider true positions (S, 3) are spread than estimated ones, 1 at rest."""
+    """Return the ratio of the spreads of true and estimated positions (S, 3), 1 at rest."""
     estimated_spread, true_spread = (float(np.linalg.norm(positions - positions.mean(axis=0)))
                                      for positions in (estimated, true))
     if true_spread < STANDSTILL_M or estimated_spread == 0.0:

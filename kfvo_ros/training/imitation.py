@@ -1,9 +1,9 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A start for PPO: the decisions of a teacher, and what they are worth.
+"""Behaviour cloning of an expert as the start of PPO.
 
-From nothing a policy keeps every second frame by chance. That is far from any good policy, and
-what a single decision changes there is lost in the noise of all the others.
+An untrained policy keeps half of the frames at random. It is far from any good policy, and the
+effect of a single decision is lost in the noise of all others.
 """
 
 from __future__ import annotations
@@ -24,46 +24,49 @@ from kfvo_ros.training.env import OBSERVATION, Observations
 from kfvo_ros.training.policy_network import PrivilegedCritic
 
 
-def imitate(model: PPO, layout: ObservationLayout, teacher: ParallaxRule, how: Imitation,
-            before_each: Callable[[], None] = lambda: None) -> None:
-    """Teach the actor to decide as the teacher does, and the critic what that is worth.
+def imitate(model: PPO, layout: ObservationLayout, expert: ParallaxRule, config: Imitation,
+            before_step: Callable[[], None] = lambda: None) -> None:
+    """Train the actor on the expert's decisions, and the critic on their returns.
 
-    `layout` is that of the model's observation; the caller has a say `before_each` step.
+    `layout` is that of the model's observation; `before_step` is called before each step of the
+    environment.
     """
     environment, policy = model.get_vec_normalize_env(), model.policy
     assert isinstance(environment, VecNormalize) and isinstance(policy, PrivilegedCritic)
-    seen, kept, returns = _watch(environment, layout, teacher, how.steps, model.gamma,
-                                 before_each)
-    optimiser = torch.optim.Adam(policy.parameters(), how.learning_rate)
+    observations, actions, returns = _demonstrate(environment, layout, expert, config.steps,
+                                                  model.gamma, before_step)
+    optimiser = torch.optim.Adam(policy.parameters(), config.learning_rate)
     rng = torch.Generator().manual_seed(model.seed or 0)
-    for _ in range(how.passes):
-        for rows in torch.randperm(len(kept), generator=rng).split(how.batch_size):
-            batch = {name: values[rows] for name, values in seen.items()}
-            values, right, _ = policy.evaluate_actions(batch, kept[rows])
-            wrong = torch.log1p(-right.exp().clamp(max=1.0 - 1e-6))
+    for _ in range(config.passes):
+        for rows in torch.randperm(len(actions), generator=rng).split(config.batch_size):
+            batch = {name: numbers[rows] for name, numbers in observations.items()}
+            values, log_prob, _ = policy.evaluate_actions(batch, actions[rows])
+            log_prob_of_other = torch.log1p(-log_prob.exp().clamp(max=1.0 - 1e-6))
             loss = (0.5 * mse_loss(values.flatten(), returns[rows])
-                    - (how.certainty * right + (1.0 - how.certainty) * wrong).mean())
+                    - (config.certainty * log_prob
+                       + (1.0 - config.certainty) * log_prob_of_other).mean())
             optimiser.zero_grad()
             loss.backward()
             optimiser.step()
 
 
-def _watch(environment: VecNormalize, layout: ObservationLayout, teacher: ParallaxRule, steps: int, gamma: float,
-           before_each: Callable[[], None]) -> tuple[dict[str, Tensor], Tensor, Tensor]:
-    """Return what the teacher saw, standardised, did, and earned from then on, discounted.
+def _demonstrate(environment: VecNormalize, layout: ObservationLayout, expert: ParallaxRule,
+                 steps: int, gamma: float, before_step: Callable[[], None]
+                 ) -> tuple[dict[str, Tensor], Tensor, Tensor]:
+    """Return standardised observations, the expert's actions, and discounted returns.
 
-    What would be earned after the end of an episode, or of the steps, is not known: nothing.
+    Rewards after the end of an episode, or after the last step, count as zero.
     """
     environment.reset()
-    seen: list[Observations] = []
-    kept, rewards, dones = [], [], []
+    observations: list[Observations] = []
+    actions, rewards, dones = [], [], []
     for _ in range(steps):
-        before_each()
-        told = environment.get_original_obs()
-        assert isinstance(told, dict)
-        seen.append({name: values.copy() for name, values in told.items()})
-        kept.append(teacher.decide(told[OBSERVATION], layout))
-        _, _, done, _ = environment.step(kept[-1])
+        before_step()
+        raw = environment.get_original_obs()
+        assert isinstance(raw, dict)
+        observations.append({name: numbers.copy() for name, numbers in raw.items()})
+        actions.append(expert.decide(raw[OBSERVATION], layout))
+        _, _, done, _ = environment.step(actions[-1])
         rewards.append(environment.get_original_reward())
         dones.append(done)
     returns, later = [], np.zeros(environment.num_envs)
@@ -71,8 +74,8 @@ def _watch(environment: VecNormalize, layout: ObservationLayout, teacher: Parall
         later = environment.normalize_reward(reward) + gamma * later * ~done
         returns.append(later)
     standardised = environment.normalize_obs(
-        {name: np.concatenate([each[name] for each in seen]) for name in seen[0]})
+        {name: np.concatenate([each[name] for each in observations]) for name in observations[0]})
     assert isinstance(standardised, dict)
-    return ({name: torch.as_tensor(values) for name, values in standardised.items()},
-            torch.as_tensor(np.concatenate(kept)),
+    return ({name: torch.as_tensor(numbers) for name, numbers in standardised.items()},
+            torch.as_tensor(np.concatenate(actions)),
             torch.as_tensor(np.concatenate(returns[::-1]), dtype=torch.float32))

@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What is trained, from what was chosen."""
+"""The plan of a training, from the recipe and the command line, and its files."""
 
 from __future__ import annotations
 
@@ -19,46 +19,47 @@ from kfvo_ros.training.config import TrainingConfig, excluded_parts
 from kfvo_ros.training.sampler import EnvironmentConfig
 from kfvo_ros.training.sequence_cache import EncodedSequenceCache
 from kfvo_ros.utils.commands import expand_ranges
+from kfvo_ros.utils.config import required
 
-ENOUGH, HELD_OUT = 5, 0.1
-"""Of so many sequences, or more, this last share is for validation where none is named."""
+MIN_SEQUENCES_TO_SPLIT, VALIDATION_SHARE = 5, 0.1
+"""With this many sequences, the last share is for validation where none is named."""
 SUFFIX = '.safetensors'
 
 
 @dataclass(frozen=True)
 class TrainingPlan:
-    """A training goes on from a checkpoint of the same plan only.
+    """Everything that determines a training; a checkpoint resumes only under the same plan.
 
-    ``sequences`` are learned from, ``validation`` chooses the best policy; ``setting`` is the
-    policy's, with the parts of the observation that it sees. ``reading`` tells how sequences are
-    read, ``vggt`` the choices of that backbone, None where it is another.
+    ``validation`` are the sequences that choose the best policy; ``signature`` is the policy's,
+    with the parts of the observation that it sees; ``vggt`` is None with another backbone.
+    Checkpoints hold it as `to_mapping` returns it.
     """
 
-    sequences: tuple[str, ...]
-    validation: tuple[str, ...]
-    seed: int
-    setting: PolicySignature
-    recipe: TrainingConfig
-    reading: SequenceOptions
-    vggt: VggtOptions | None
+    sequences: tuple[str, ...] = required()
+    validation: tuple[str, ...] = required()
+    seed: int = required()
+    signature: PolicySignature = required(key='setting')
+    recipe: TrainingConfig = required()
+    sequence_options: SequenceOptions = required(key='reading')
+    vggt: VggtOptions | None = required()
 
     def seed_at(self, steps: int) -> int:
-        """Return the seed of what comes after so many steps: nothing is driven again."""
+        """Return the seed of what follows these steps, so that no episode is repeated."""
         return (self.seed + steps) % 2 ** 32
 
 
 @dataclass(frozen=True)
 class TrainingSetup:
-    """What the command line and the recipe say.
+    """The choices of the command line and the recipe.
 
-    ``seed`` is the training's. The backbone's, in ``odometry``, is another: what it tracked
-    serves trainings of all seeds.
+    ``seed`` is the training's. ``odometry`` has the backbone's, which is another: encoded
+    sequences serve trainings of all seeds.
     """
 
     seed: int
     recipe: TrainingConfig
     odometry: OdometryOptions
-    reading: SequenceOptions
+    sequence_options: SequenceOptions
     vggt: VggtOptions
     cache: Path | None
 
@@ -66,46 +67,48 @@ class TrainingSetup:
              backbone: Backbone) -> TrainingPlan:
         """Return the plan for a backbone; raises KfvoError.
 
-        Ranges of sequences are spelled out, and some held out where `validation` names none. Of
-        the rail there is what the backbone's tracks allow.
+        Ranges of sequences are expanded, and some are split off for validation where
+        `validation` names none. Without tracks only the gap of the guard is kept.
         """
-        learned, held_out = expand_ranges(sequences), expand_ranges(validation)
-        if not held_out and len(learned) >= ENOUGH:
-            count = max(round(HELD_OUT * len(learned)), 1)
-            learned, held_out = learned[:-count], learned[-count:]
+        training, validating = expand_ranges(sequences), expand_ranges(validation)
+        if not validating and len(training) >= MIN_SEQUENCES_TO_SPLIT:
+            count = max(round(VALIDATION_SHARE * len(training)), 1)
+            training, validating = training[:-count], training[-count:]
         recipe = self.recipe
-        if recipe.rail is not None and not backbone.offers_tracks:
-            recipe = replace(recipe, rail=recipe.rail.without_tracks())
-        present = factory.signature_of(self.odometry, backbone)
-        left_out = excluded_parts(recipe.without, present.observation)
-        seen = tuple(part for part in present.observation if part[0] not in left_out)
-        missing = recipe.teacher.unseen_in(seen) if recipe.teacher is not None else []
+        if recipe.guard is not None and not backbone.offers_tracks:
+            recipe = replace(recipe, guard=recipe.guard.without_tracks())
+        signature = factory.signature_of(self.odometry, backbone)
+        excluded = excluded_parts(recipe.without, signature.observation)
+        visible = tuple(part for part in signature.observation if part[0] not in excluded)
+        missing = recipe.expert.missing_signals(visible) if recipe.expert is not None else []
         if missing:
-            raise KfvoError('teacher: expected null where its pupil does not observe '
+            raise KfvoError('teacher: expected null where the policy does not observe '
                             f'{" and ".join(missing)}')
-        return TrainingPlan(learned, held_out, self.seed, replace(present, observation=seen), recipe,
-                            self.reading, self.vggt if self.odometry.backbone == 'vggt' else None)
+        return TrainingPlan(training, validating, self.seed,
+                            replace(signature, observation=visible), recipe,
+                            self.sequence_options,
+                            self.vggt if self.odometry.backbone == 'vggt' else None)
 
-    def lesson(self, plan: TrainingPlan) -> EnvironmentConfig:
-        """Return what environments are made from."""
+    def environment_config(self, plan: TrainingPlan) -> EnvironmentConfig:
+        """Return the configuration of the plan's environments."""
         recipe = plan.recipe
-        return EnvironmentConfig(plan.sequences, self.reading, self.odometry, self.vggt,
-                                 recipe.augmentation, recipe.variants, recipe.tracks, recipe.reward,
-                                 recipe.span, recipe.alpha, recipe.rail or NO_GUARD,
-                                 plan.setting.observation, self.cache)
+        return EnvironmentConfig(plan.sequences, self.sequence_options, self.odometry, self.vggt,
+                                 recipe.augmentation, recipe.variants, recipe.tracks,
+                                 recipe.reward, recipe.span, recipe.alpha,
+                                 recipe.guard or NO_GUARD, plan.signature.observation, self.cache)
 
-    def archive(self, backbone: Backbone) -> EncodedSequenceCache:
-        """Return where the drives of a validation come from, with the tracks of an odometry."""
-        return EncodedSequenceCache(backbone, self.reading,
+    def sequence_cache(self, backbone: Backbone) -> EncodedSequenceCache:
+        """Return the source of validation and test sequences, with as many tracks as in use."""
+        return EncodedSequenceCache(backbone, self.sequence_options,
                                     {'seed': self.odometry.seed, 'tracks': FEATURES}, self.cache,
-                                    live=not backbone.offers_tracks)
+                                    keep_images=not backbone.offers_tracks)
 
 
 class TrainingFiles:
-    """``output`` is the best policy; the rest is in the ``folder`` beside it.
+    """Files of a training: ``output`` is the best policy, the rest is in ``folder`` beside it.
 
-    That is ``checkpoint``, from which a training goes on, the ``last`` policy, and the logs of
-    TensorBoard. Raises KfvoError for an output that is no .safetensors file.
+    These are ``checkpoint``, from which a training resumes, the ``last`` policy, and the logs of
+    TensorBoard. Raises KfvoError for an output that is not a .safetensors file.
     """
 
     def __init__(self, output: str) -> None:
@@ -117,14 +120,14 @@ class TrainingFiles:
         self.last = self.folder / f'last{SUFFIX}'
 
     def check(self, resume: bool, overwrite: bool) -> None:
-        """Raise KfvoError where an earlier training is, neither to `resume` nor to `overwrite`."""
-        there = [path for path in (self.output, self.checkpoint, self.last) if path.exists()]
-        if there and not resume and not overwrite:
-            raise KfvoError(f'{there[0]} is there already; choose another --output, or add '
-                            '--resume to go on or --overwrite to begin anew')
+        """Raise KfvoError for files of an earlier training, unless to `resume` or `overwrite`."""
+        existing = [path for path in (self.output, self.checkpoint, self.last) if path.exists()]
+        if existing and not resume and not overwrite:
+            raise KfvoError(f'{existing[0]} is there already; choose another --output, or add '
+                            '--resume to go on or --overwrite to replace it')
 
     def prepare(self, resume: bool) -> None:
-        """Make the folder, empty of an earlier training unless to `resume`; raises KfvoError."""
+        """Make the folder, and remove an earlier training unless to `resume`; raises KfvoError."""
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             if not resume:

@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Actor and critic as two networks that share nothing; the critic alone sees the truth."""
+"""Actor and critic networks without shared layers; only the critic sees privileged input."""
 
 from __future__ import annotations
 
@@ -17,45 +17,48 @@ from torch import Tensor, nn
 from kfvo_ros.keyframes.learned import Actor, Layer
 from kfvo_ros.training.env import OBSERVATION, PRIVILEGED
 
+INPUTS = (OBSERVATION, PRIVILEGED)
+"""Inputs of the critic, in the order of its features; the actor has the first only."""
+
 
 class ConcatenatedInputs(BaseFeaturesExtractor):
-    """The observation, and behind it what is privileged, as they are."""
+    """Concatenates observation and privileged observation."""
 
     def __init__(self, observation_space: spaces.Dict) -> None:
         super().__init__(observation_space, sum(_sizes(observation_space)))
 
     def forward(self, observations: dict[str, Tensor]) -> Tensor:
-        """Return (B, both sizes)."""
-        return torch.cat([observations[OBSERVATION], observations[PRIVILEGED]], dim=1)
+        """Return features (B, observation size + privileged size)."""
+        return torch.cat([observations[name] for name in INPUTS], dim=1)
 
 
 class ActorAndCritic(nn.Module):
-    """Two ReLU networks of two layers each; the last layer of either is the policy's own."""
+    """Hidden layers of actor and critic: two of `width` each; the heads belong to the policy."""
 
-    def __init__(self, observed: int, privileged: int, width: int) -> None:
+    def __init__(self, observation_size: int, privileged_size: int, width: int) -> None:
         super().__init__()
-        self.observed = observed
+        self.observation_size = observation_size
         self.latent_dim_pi = self.latent_dim_vf = width
-        self.actor = _layers(observed, width)
-        self.critic = _layers(observed + privileged, width)
+        self.actor = _hidden_layers(observation_size, width)
+        self.critic = _hidden_layers(observation_size + privileged_size, width)
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the last hidden layers of both, (B, width)."""
+        """Return the latent features of actor and critic, (B, width) each."""
         return self.forward_actor(features), self.forward_critic(features)
 
     def forward_actor(self, features: Tensor) -> Tensor:
-        """Return the actor's last hidden layer; it reads the observation only."""
-        return self.actor(features[:, :self.observed])
+        """Return the actor's latent features (B, width); it reads the observation only."""
+        return self.actor(features[:, :self.observation_size])
 
     def forward_critic(self, features: Tensor) -> Tensor:
-        """Return the critic's last hidden layer."""
+        """Return the critic's latent features (B, width)."""
         return self.critic(features)
 
 
 class PrivilegedCritic(ActorCriticPolicy):
-    """For `PPO(PrivilegedCritic, environment, policy_kwargs={'width': 256})`.
+    """Asymmetric actor-critic policy (paper, sections IV-C and IV-E).
 
-    Source: the paper, sections IV-C and IV-E.
+    Use: ``PPO(PrivilegedCritic, environment, policy_kwargs={'width': 256})``.
     """
 
     def __init__(self, *arguments: Any, width: int, **options: Any) -> None:
@@ -64,30 +67,31 @@ class PrivilegedCritic(ActorCriticPolicy):
 
     def _build_mlp_extractor(self) -> None:
         assert isinstance(self.observation_space, spaces.Dict)
-        observed, privileged = _sizes(self.observation_space)
-        self.mlp_extractor = ActorAndCritic(observed, privileged, self._width)  # type: ignore[assignment]
+        observation_size, privileged_size = _sizes(self.observation_space)
+        self.mlp_extractor = ActorAndCritic(  # type: ignore[assignment]
+            observation_size, privileged_size, self._width)
 
 
-def _sizes(space: spaces.Dict) -> list[int]:
-    """Return how many numbers are observed, and how many privileged."""
-    return [spaces.flatdim(space[name]) for name in (OBSERVATION, PRIVILEGED)]
+def export_actor(policy: PrivilegedCritic, statistics: RunningMeanStd, epsilon: float) -> Actor:
+    """Return the actor with the running `statistics` (D,) of its raw observations.
 
-
-def _layers(size: int, width: int) -> nn.Sequential:
-    return nn.Sequential(nn.Linear(size, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU())
-
-
-def export_actor(policy: PrivilegedCritic, seen: RunningMeanStd, epsilon: float) -> Actor:
-    """Return the actor with the statistics of what it has `seen`, not standardised, (D,).
-
-    `epsilon` is that of the standardisation in training, on the variance.
+    `epsilon` is what VecNormalize adds to the variance in training.
     """
     networks = policy.mlp_extractor
     assert isinstance(networks, ActorAndCritic)
-    steps = [*networks.actor, policy.action_net]
+    modules = [*networks.actor, policy.action_net]
     return Actor(
-        np.asarray(seen.mean, dtype=np.float64),
-        np.sqrt(np.asarray(seen.var, dtype=np.float64) + epsilon),
-        tuple(Layer(step.weight.detach().cpu().numpy().copy(),
-                    step.bias.detach().cpu().numpy().copy())
-              for step in steps if isinstance(step, nn.Linear)))
+        np.asarray(statistics.mean, dtype=np.float64),
+        np.sqrt(np.asarray(statistics.var, dtype=np.float64) + epsilon),
+        tuple(Layer(module.weight.detach().cpu().numpy().copy(),
+                    module.bias.detach().cpu().numpy().copy())
+              for module in modules if isinstance(module, nn.Linear)))
+
+
+def _sizes(space: spaces.Dict) -> list[int]:
+    """Return the sizes of observation and privileged observation."""
+    return [spaces.flatdim(space[name]) for name in INPUTS]
+
+
+def _hidden_layers(size: int, width: int) -> nn.Sequential:
+    return nn.Sequential(nn.Linear(size, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU())

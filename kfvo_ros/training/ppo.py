@@ -1,13 +1,13 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""PPO of a keyframe policy, from its first step or from a checkpoint to its last step."""
+"""PPO of a keyframe policy, from the first step or a checkpoint to the last step."""
 
 from __future__ import annotations
 
 import math
 import warnings
 from dataclasses import asdict
-from typing import Any
+from typing import Any, Protocol
 
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
@@ -21,31 +21,52 @@ from kfvo_ros.keyframes.learned import CLIP, PolicyFile
 from kfvo_ros.training.checkpoint import Checkpoint, statistics_of
 from kfvo_ros.training.config import TrainingConfig
 from kfvo_ros.training.env import OBSERVATION
-from kfvo_ros.training.evaluation import Score, TrainingCallback, Validation
+from kfvo_ros.training.evaluation import PolicyEvaluation, Score
 from kfvo_ros.training.imitation import imitate
 from kfvo_ros.training.plan import TrainingFiles, TrainingPlan
 from kfvo_ros.training.policy_network import PrivilegedCritic, export_actor
+from kfvo_ros.utils.config import to_mapping
 
 EPSILON = 1e-8
-"""Of the standardisation, on the variance."""
+"""VecNormalize adds it to the variance of observations."""
 
 
-class Training:
-    """Learns until the plan is fulfilled: `learn`; when that was interrupted, `save`.
+class TrainingCallback(Protocol):
+    """Receives the progress of a training.
 
-    The best policy by ATE is written as soon as it is known; without validation that is the
-    last one. `references` were scored on the same drives; `about` goes into the policy files.
+    What it raises ends the training between two steps, so the state can be saved.
+    """
+
+    def on_step(self, steps: int) -> None:
+        """Receive the number of steps so far; 0 while an expert is imitated."""
+
+    def on_rollout(self, mean_return: float, keyframe_rate: float) -> None:
+        """Receive the mean return of the latest episodes and the share of kept frames."""
+
+    def on_validation_sequence(self) -> None:
+        """Receive that the next validation sequence starts."""
+
+    def on_validation(self, steps: int, score: Score, is_best: bool) -> None:
+        """Receive the score of the policy after these steps."""
+
+
+class Trainer:
+    """Trains a policy: `learn` to the end of the plan, `save` after an interruption.
+
+    The best policy by ATE is written when it is found; without `validation` that is the last
+    one. `reference_scores` are those of other policies on the validation sequences; `metadata`
+    goes into the policy files.
     """
 
     def __init__(self, plan: TrainingPlan, environment: VecEnv, files: TrainingFiles,
-                 validation: Validation | None, references: dict[str, Score],
-                 about: dict[str, str], checkpoint: Checkpoint | None = None) -> None:
+                 validation: PolicyEvaluation | None, reference_scores: dict[str, Score],
+                 metadata: dict[str, str], checkpoint: Checkpoint | None = None) -> None:
         self.plan, self._files, self._validation = plan, files, validation
-        self._references, self._about = references, about
+        self._reference_scores, self._metadata = reference_scores, metadata
         self.steps, self._best = 0, math.inf
         if checkpoint is not None:
             self.steps = checkpoint.steps
-            if files.output.exists():  # else the best from now on, for there is no other
+            if files.output.exists():  # without that file the next policy is the best
                 self._best = checkpoint.best
         self._saved_at = self.steps
         self.model = make_model(environment, plan.recipe, plan.seed_at(self.steps))
@@ -53,43 +74,43 @@ class Training:
             checkpoint.restore(self.model)
         self.model.set_logger(Logger(str(files.folder),
                                      [TensorBoardOutputFormat(str(files.folder))]))
-        for name, score in references.items():
+        for name, score in reference_scores.items():
             self._log(name, score)
 
-    def learn(self, witness: TrainingCallback) -> None:
-        """Go through all steps that are left; raises what the witness does."""
-        teacher, imitation = self.plan.recipe.teacher, self.plan.recipe.imitation
+    def learn(self, callback: TrainingCallback) -> None:
+        """Train for the steps that are left; errors of the callback pass through."""
+        expert, imitation = self.plan.recipe.expert, self.plan.recipe.imitation
         try:
-            if teacher is not None and imitation is not None and self.steps == 0:
-                imitate(self.model, self.plan.setting.observation, teacher, imitation,
-                        lambda: witness.stepped(0))
-            self.model.learn(max(self.plan.recipe.steps - self.steps, 0), _Rounds(self, witness),
-                             reset_num_timesteps=False)
+            if expert is not None and imitation is not None and self.steps == 0:
+                imitate(self.model, self.plan.signature.observation, expert, imitation,
+                        lambda: callback.on_step(0))
+            self.model.learn(max(self.plan.recipe.steps - self.steps, 0),
+                             _PpoCallback(self, callback), reset_num_timesteps=False)
         finally:
-            self.model.logger.close()  # a thread and a file
+            self.model.logger.close()  # it holds a thread and a file
 
-    def after_update(self, steps: int, is_last: bool, witness: TrainingCallback) -> None:
-        """Take note that all `steps` were learned from; validate and save when it is time."""
+    def after_update(self, steps: int, is_last: bool, callback: TrainingCallback) -> None:
+        """Record that the policy learned from `steps`; validate and save when it is due."""
         self.steps = steps
         if not is_last and steps - self._saved_at < self.plan.recipe.validation_every:
             return
         self._saved_at = steps
         scores = None
         if self._validation is not None:
-            policy = self.policy_file().policy(self._validation.setting)
-            score = self._validation.score(policy, witness.validating)
-            scores = self._references | {'learned': score}
+            policy = self.policy_file().policy(self._validation.signature)
+            score = self._validation.score(policy, callback.on_validation_sequence)
+            scores = self._reference_scores | {'learned': score}
             is_best = score.ate_percent < self._best
             if is_best:
                 self._best = score.ate_percent
                 self.policy_file(scores).write(self._files.output)
             self._log('learned', score)
-            witness.validated(steps, score, is_best)
+            callback.on_validation(steps, score, is_best)
         self.model.logger.dump(steps)
         self.save(scores)
 
     def save(self, scores: dict[str, Score] | None = None) -> None:
-        """Write the policy as it is now, and a checkpoint to go on from."""
+        """Write the present policy and a checkpoint."""
         last = self.policy_file(scores)
         last.write(self._files.last)
         if self._validation is None and self.steps:
@@ -98,59 +119,59 @@ class Training:
             self._files.checkpoint)
 
     def policy_file(self, scores: dict[str, Score] | None = None) -> PolicyFile:
-        """Return the policy as it is now, with the scores in its validation if it had one."""
+        """Return the present policy, with its validation scores if there are any."""
         policy = self.model.policy
         assert isinstance(policy, PrivilegedCritic)
-        plan = self.plan
+        plan = to_mapping(self.plan)
         return PolicyFile(
             export_actor(policy, statistics_of(self.model)[OBSERVATION], EPSILON),
-            plan.recipe.rail or NO_GUARD, plan.setting,
-            {**self._about, 'sequences': plan.sequences, 'validation': plan.validation,
-             'seed': plan.seed, 'steps': self.steps, 'recipe': asdict(plan.recipe),
-             'reading': asdict(plan.reading), 'vggt': plan.vggt and asdict(plan.vggt),
+            self.plan.recipe.guard or NO_GUARD, self.plan.signature,
+            {**self._metadata,
+             **{key: plan[key] for key in ('sequences', 'validation', 'seed')},
+             'steps': self.steps, **{key: plan[key] for key in ('recipe', 'reading', 'vggt')},
              'scores': {name: asdict(score) for name, score in (scores or {}).items()}})
 
-    def _log(self, name: str, score: Score) -> None:
-        for what, value in asdict(score).items():
-            self.model.logger.record(f'validation_{what}/{name}', value)
+    def _log(self, policy: str, score: Score) -> None:
+        for quantity, value in asdict(score).items():
+            self.model.logger.record(f'validation_{quantity}/{policy}', value)
 
 
 def make_model(environment: VecEnv, recipe: TrainingConfig, seed: int) -> PPO:
-    """Return the learner of an environment, of its returns and standardised observations."""
+    """Return the PPO model on standardised observations and returns of an environment."""
     ppo: dict[str, Any] = asdict(recipe.ppo)
     normalised = VecNormalize(VecMonitor(environment), norm_reward=ppo.pop('normalise_reward'),
                               clip_obs=CLIP, gamma=recipe.ppo.gamma, epsilon=EPSILON)
     rollout = recipe.ppo.n_steps * environment.num_envs
     batch_size = min(ppo.pop('batch_size') or rollout, rollout)
-    with warnings.catch_warnings():  # one batch of a rollout may be smaller
+    with warnings.catch_warnings():  # the last batch of a rollout may be smaller
         warnings.filterwarnings('ignore', 'You have specified a mini-batch size')
-        model = PPO(PrivilegedCritic, normalised, recipe.learning_rate.at, batch_size=batch_size,
+        model = PPO(PrivilegedCritic, normalised, recipe.learning_rate, batch_size=batch_size,
                     **ppo, seed=seed, device='cpu', policy_kwargs={'width': recipe.width})
-    model.set_logger(Logger(None, []))  # without one it would make a folder in /tmp
+    model.set_logger(Logger(None, []))  # the default logger makes a folder in /tmp
     return model
 
 
-class _Rounds(BaseCallback):
-    """Brings what happens in PPO to the training and its witness."""
+class _PpoCallback(BaseCallback):
+    """Passes the events of stable-baselines3 to the trainer and its callback."""
 
-    def __init__(self, training: Training, witness: TrainingCallback) -> None:
+    def __init__(self, trainer: Trainer, callback: TrainingCallback) -> None:
         super().__init__()
-        self._training, self._witness = training, witness
+        self._trainer, self._callback = trainer, callback
 
     def _on_rollout_start(self) -> None:
-        if self.model.num_timesteps > self._training.steps:
-            self._training.after_update(self.model.num_timesteps, False, self._witness)
+        if self.model.num_timesteps > self._trainer.steps:
+            self._trainer.after_update(self.model.num_timesteps, False, self._callback)
 
     def _on_step(self) -> bool:
-        self._witness.stepped(self.model.num_timesteps)
+        self._callback.on_step(self.model.num_timesteps)
         return True
 
     def _on_rollout_end(self) -> None:
         keyframe_rate = float(self.locals['rollout_buffer'].actions.mean())
         self.logger.record('rollout/keyframe_rate', keyframe_rate)
         episodes = self.model.ep_info_buffer or ()
-        self._witness.collected(float(safe_mean([each['r'] for each in episodes])),
-                                keyframe_rate)
+        self._callback.on_rollout(float(safe_mean([each['r'] for each in episodes])),
+                                  keyframe_rate)
 
     def _on_training_end(self) -> None:
-        self._training.after_update(self.model.num_timesteps, True, self._witness)
+        self._trainer.after_update(self.model.num_timesteps, True, self._callback)

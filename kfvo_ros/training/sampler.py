@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""From names of sequences to episodes without end, and to an environment that steps them."""
+"""Endless episodes of sequences, and the environments that step them."""
 
 from __future__ import annotations
 
@@ -27,26 +27,26 @@ from kfvo_ros.training.rewards import LocalReward, PaperReward, Reward
 from kfvo_ros.training.sequence_cache import EncodedSequenceCache
 from kfvo_ros.training.vec_workers import VecWorkers
 
-LEAST_LEFT = 150
-"""An episode begins anywhere but in so many last frames of a drive."""
-MOST_UNASKED = 10
-"""So many episodes in a row without a decision, and no sequence left out, are enough."""
+MIN_EPISODE_FRAMES = 150
+"""Frames that are left where an episode starts; a shorter sequence is run as a whole."""
+MAX_EMPTY_EPISODES = 10
+"""Episodes in a row without a decision, or one of each sequence if these are more."""
 EnvironmentSpec = tuple[tuple[str, ...], np.random.SeedSequence]
-"""One episode at a time: the sequences it takes turns in, and its seed."""
+"""The sequences of one source of episodes, and its seed."""
 
 
 @dataclass(frozen=True)
 class EnvironmentConfig:
-    """What is learned from, and how: all that a process needs to make episodes.
+    """Everything that a process needs to make episodes.
 
-    ``tracks`` are followed per frame. A sequence has so many ``variants``, tracked once and kept
-    in the folder ``cache``. ``seen`` are the parts of the observation that are told, None for
-    all. ``reward`` is ``paper`` or ``local``, over ``span`` frames, and ``alpha`` what a keyframe
-    is worth in it.
+    ``tracks`` per frame are those of the geometric backbone. Each sequence has ``variants``
+    augmented versions, encoded once and stored in the folder ``cache``. ``observation`` are the
+    parts that the policy sees, None for all. ``reward`` is ``paper`` or ``local``, over ``span``
+    frames, with ``alpha`` for a keyframe.
     """
 
     sequences: tuple[str, ...]
-    reading: SequenceOptions = SequenceOptions()
+    sequence_options: SequenceOptions = SequenceOptions()
     odometry: OdometryOptions = OdometryOptions()
     vggt: VggtOptions = VggtOptions()
     augmentation: Augmentation = Augmentation()
@@ -55,85 +55,86 @@ class EnvironmentConfig:
     reward: str = 'local'
     span: int = 1000
     alpha: float = 0.0
-    rail: KeyframeGuard = KeyframeGuard()
-    seen: ObservationLayout | None = None
+    guard: KeyframeGuard = KeyframeGuard()
+    observation: ObservationLayout | None = None
     cache: Path | None = None
 
-    def backbone(self) -> Backbone:
-        """Return the backbone to learn with; raises KfvoError."""
+    def make_backbone(self) -> Backbone:
+        """Return the backbone of the episodes; raises KfvoError."""
         if self.odometry.backbone == 'geometric':
             from kfvo_ros.backbones.geometric.backbone import GeometricBackbone
             return GeometricBackbone(self.odometry.seed, self.tracks)
         return factory.make_backbone(self.odometry, self.vggt)
 
-    def archive(self, backbone: Backbone) -> EncodedSequenceCache:
-        """Return where the drives come from: tracked once, or held as images to be encoded."""
-        return EncodedSequenceCache(backbone, self.reading,
-                                    {'seed': self.odometry.seed, 'tracks': self.tracks}, self.cache,
-                                    live=not backbone.offers_tracks)
+    def sequence_cache(self, backbone: Backbone) -> EncodedSequenceCache:
+        """Return the source of sequences; those of a backbone without tracks keep images."""
+        return EncodedSequenceCache(backbone, self.sequence_options,
+                                    {'seed': self.odometry.seed, 'tracks': self.tracks},
+                                    self.cache, keep_images=not backbone.offers_tracks)
 
-    def new_reward(self, frames: int) -> Reward:
-        """Return the reward of one episode of so many frames."""
+    def make_reward(self, frames: int) -> Reward:
+        """Return the reward of one episode with this many frames."""
         if self.reward == 'paper':
             return PaperReward(self.alpha)
         return LocalReward(min(self.span, frames), self.alpha)
 
 
 class EpisodeSampler:
-    """One process's backbone and drives, and the episodes it makes of them."""
+    """Samples episodes with one backbone and one sequence cache, in one process."""
 
-    def __init__(self, lesson: EnvironmentConfig) -> None:
-        self._lesson = lesson
-        self._backbone = lesson.backbone()
-        self._present = factory.signature_of(lesson.odometry, self._backbone)
-        self._archive = lesson.archive(self._backbone)
+    def __init__(self, config: EnvironmentConfig) -> None:
+        self._config = config
+        self._backbone = config.make_backbone()
+        self._signature = factory.signature_of(config.odometry, self._backbone)
+        self._cache = config.sequence_cache(self._backbone)
 
-    def environment(self, pupils: Sequence[EnvironmentSpec]) -> KeyframeEnvironment:
-        """Return an environment that steps one episode of each at a time."""
-        everything = self._present.observation
-        return KeyframeEnvironment(self._backbone, [self._episodes(*pupil) for pupil in pupils],
-                                   indices_of(self._lesson.seen or everything, everything))
+    def environment(self, specs: Sequence[EnvironmentSpec]) -> KeyframeEnvironment:
+        """Return an environment that steps one episode of each spec at a time."""
+        layout = self._signature.observation
+        return KeyframeEnvironment(self._backbone, [self._episodes(*spec) for spec in specs],
+                                   indices_of(self._config.observation or layout, layout))
 
     def _episodes(self, sequences: tuple[str, ...],
                   seed: np.random.SeedSequence) -> Iterator[Episode]:
-        """Yield episodes for ever: each sequence in turn, in a variant, from somewhere on.
+        """Yield episodes without end: all sequences in random order, variant and start frame.
 
-        Raises KfvoError where they end again and again before there is anything to decide.
+        Raises KfvoError when too many episodes in a row have no decision.
         """
-        lesson, rng, unasked = self._lesson, np.random.default_rng(seed), 0
-        while unasked < max(MOST_UNASKED, len(sequences)):
+        config, rng, empty = self._config, np.random.default_rng(seed), 0
+        while empty < max(MAX_EMPTY_EPISODES, len(sequences)):
             for text in rng.permutation(sequences):
-                drive = self._archive.variant(str(text), lesson.augmentation,
-                                              int(rng.integers(lesson.variants)))
-                start = int(rng.integers(max(1, len(drive) - LEAST_LEFT)))
-                episode = Episode(drive.since(start), self._backbone, self._present.scale_rule,
-                                  self._present.window_size, lesson.rail,
-                                  lesson.new_reward(len(drive) - start))
+                sequence = self._cache.variant(str(text), config.augmentation,
+                                               int(rng.integers(config.variants)))
+                start = int(rng.integers(max(1, len(sequence) - MIN_EPISODE_FRAMES)))
+                episode = Episode(sequence.from_frame(start), self._backbone,
+                                  self._signature.scale_rule, self._signature.window_size,
+                                  config.guard, config.make_reward(len(sequence) - start))
                 yield episode
-                unasked = 0 if episode.asked else unasked + 1
+                empty = 0 if episode.reached_decision else empty + 1
         raise KfvoError(f'{", ".join(sequences)}: expected decisions to learn from, there were '
-                        f'none in {unasked} episodes: the camera is lost or at rest, or the rail '
-                        'decides all')
+                        f'none in {empty} episodes: the camera is lost or at rest, or the rail '
+                        'forces every decision')
 
 
-def make_environment(lesson: EnvironmentConfig, environments: int, workers: int, seed: int) -> VecEnv:
-    """Return so many episodes at once, stepped by so many processes; raises KfvoError.
+def make_environment(config: EnvironmentConfig, environments: int, workers: int,
+                     seed: int) -> VecEnv:
+    """Return an environment of this many episodes, stepped by this many processes.
 
-    How many workers there are changes nothing but the time; one is this process itself. What
-    cannot be learned from, because nobody knows where its camera was, is refused at once.
+    The number of workers changes nothing but the time; one worker is this process itself.
+    Raises KfvoError at once for a sequence without true camera poses.
     """
-    for text in lesson.sequences:
-        true_trajectory(factory.make_sequence(text, lesson.reading))
+    for text in config.sequences:
+        true_trajectory(factory.make_sequence(text, config.sequence_options))
     seeds = np.random.SeedSequence(seed).spawn(environments)
-    count = len(lesson.sequences)
-    pupils: list[EnvironmentSpec] = [(lesson.sequences[number % count::environments], seeds[number])
-                                     for number in range(environments)]
-    classes = [pupils[part[0]:part[-1] + 1]
-               for part in np.array_split(np.arange(environments), min(workers, environments))]
-    if len(classes) == 1:
-        return EpisodeSampler(lesson).environment(pupils)
-    return VecWorkers([partial(_open, lesson, each) for each in classes])
+    count = len(config.sequences)
+    specs: list[EnvironmentSpec] = [(config.sequences[index % count::environments], seeds[index])
+                                    for index in range(environments)]
+    parts = [specs[part[0]:part[-1] + 1]
+             for part in np.array_split(np.arange(environments), min(workers, environments))]
+    if len(parts) == 1:
+        return EpisodeSampler(config).environment(specs)
+    return VecWorkers([partial(_sample, config, part) for part in parts])
 
 
-def _open(lesson: EnvironmentConfig, pupils: list[EnvironmentSpec]) -> KeyframeEnvironment:
-    return EpisodeSampler(lesson).environment(pupils)
+def _sample(config: EnvironmentConfig, specs: list[EnvironmentSpec]) -> KeyframeEnvironment:
+    return EpisodeSampler(config).environment(specs)

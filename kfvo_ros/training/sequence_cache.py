@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Drives by the names of their sequences: recorded once, kept in memory and in a folder."""
+"""Cache of encoded sequences by name, in memory and in a folder."""
 
 from __future__ import annotations
 
@@ -28,110 +28,115 @@ from kfvo_ros.training.encoded_sequence import (
     write_encoded_sequence,
 )
 
-LEAST_FRAMES = 20
-"""A shorter drive is over before much was decided."""
-MOST_HELD = 128
-"""So many drives stay in memory: of 200 frames with 400 tracks, one takes 3 MB."""
+MIN_FRAMES = 20
+"""Fewer frames give an episode hardly any decisions."""
+MAX_IN_MEMORY = 128
+"""Sequences in memory: one of 200 frames with 400 tracks takes 3 MB."""
+VariantKey = tuple[str, Augmentation | None, int]
+"""Name of a sequence, its augmentation, None for none, and the variant's number."""
 
 
 @dataclass
 class EncodedSequenceCache:
-    """Gives drives; `about` names whatever else they depend on: the backbone and its choices.
+    """Encodes sequences, each once; `settings` of the backbone distinguish files in `folder`.
 
-    Without a `folder` nothing is kept on disk. With `live` frames keep their images, to be
-    encoded when their turn comes, and nothing is kept at all.
+    Without a `folder` the cache is in memory only. With `keep_images` the frames keep their
+    images, to be encoded in the episode, and nothing is cached.
     """
 
     backbone: Backbone
-    reading: SequenceOptions
-    about: dict[str, Any] = field(default_factory=dict)
+    sequence_options: SequenceOptions
+    settings: dict[str, Any] = field(default_factory=dict)
     folder: Path | None = None
-    live: bool = False
-    _held: OrderedDict[tuple[str, Augmentation | None, int], EncodedSequence] = field(
-        default_factory=OrderedDict)
+    keep_images: bool = False
+    _in_memory: OrderedDict[VariantKey, EncodedSequence] = field(default_factory=OrderedDict)
 
     def __post_init__(self) -> None:
-        gc.unfreeze()  # What froze along with an earlier archive's drives may be garbage by now.
+        gc.unfreeze()  # the frozen sequences of an earlier cache may be garbage by now
 
-    def whole(self, text: str) -> EncodedSequence:
-        """Return the sequence as it is; raises KfvoError where it cannot be learned from."""
-        return self._drive(text, None, 0)
+    def sequence(self, text: str) -> EncodedSequence:
+        """Return a sequence without augmentation; raises KfvoError where it cannot be used."""
+        return self._get(text, None, 0)
 
-    def wholes(self, texts: tuple[str, ...]) -> CachedSequences:
-        """Return many sequences as they are."""
+    def sequences(self, texts: tuple[str, ...]) -> CachedSequences:
+        """Return many sequences without augmentation, loaded when they are accessed."""
         return CachedSequences(self, texts)
 
     def variant(self, text: str, augmentation: Augmentation, number: int) -> EncodedSequence:
-        """Return one of its variants; raises KfvoError where it cannot be learned from."""
-        return self._drive(text, augmentation, number)
+        """Return a variant of a sequence; raises KfvoError where it cannot be used."""
+        return self._get(text, augmentation, number)
 
-    def _drive(self, text: str, augmentation: Augmentation | None, number: int) -> EncodedSequence:
-        if self.live:
-            return self._record(text, augmentation, number)
-        asked = (text, augmentation, number)
-        if asked not in self._held:
-            self._held[asked] = self._recall(*asked)
-            if len(self._held) > MOST_HELD:
-                self._held.popitem(last=False)
-            gc.collect()  # What is garbage already would stay for ever.
-            gc.freeze()  # Thousands of objects, none in a cycle: not to be searched for garbage.
-        self._held.move_to_end(asked)
-        return self._held[asked]
+    def _get(self, text: str, augmentation: Augmentation | None, number: int) -> EncodedSequence:
+        if self.keep_images:
+            return self._encode(text, augmentation, number)
+        key: VariantKey = (text, augmentation, number)
+        if key not in self._in_memory:
+            self._in_memory[key] = self._load(*key)
+            if len(self._in_memory) > MAX_IN_MEMORY:
+                self._in_memory.popitem(last=False)
+            gc.collect()  # garbage would be frozen, too
+            gc.freeze()  # thousands of objects without a cycle slow the garbage collector down
+        self._in_memory.move_to_end(key)
+        return self._in_memory[key]
 
-    def _recall(self, text: str, augmentation: Augmentation | None, number: int) -> EncodedSequence:
-        """Return the drive from the folder; record it where it is not there."""
+    def _load(self, text: str, augmentation: Augmentation | None,
+              number: int) -> EncodedSequence:
+        """Read the sequence from the folder; encode and write one that is not there."""
         if self.folder is None:
-            return self._record(text, augmentation, number)
-        path = self.folder / f'{self._key(text, augmentation, number)}.safetensors'
-        drive = read_encoded_sequence(path)
-        if drive is None:
-            drive = self._record(text, augmentation, number)
-            write_encoded_sequence(path, drive)
-        return drive
+            return self._encode(text, augmentation, number)
+        path = self.folder / f'{self._file_stem(text, augmentation, number)}.safetensors'
+        sequence = read_encoded_sequence(path)
+        if sequence is None:
+            sequence = self._encode(text, augmentation, number)
+            write_encoded_sequence(path, sequence)
+        return sequence
 
-    def _record(self, text: str, augmentation: Augmentation | None, number: int) -> EncodedSequence:
-        sequence: Sequence = factory.make_sequence(text, self.reading)
-        backbone, stop = None if self.live else self.backbone, self.reading.stop
+    def _encode(self, text: str, augmentation: Augmentation | None,
+                number: int) -> EncodedSequence:
+        source: Sequence = factory.make_sequence(text, self.sequence_options)
+        backbone, stop = None if self.keep_images else self.backbone, self.sequence_options.stop
         if augmentation is None:
-            drive = encode_sequence(sequence, backbone, stop)
+            encoded = encode_sequence(source, backbone, stop)
         else:
-            drive = encode_sequence(SequenceVariant(sequence, augmentation, number, stop), backbone)
-        if len(drive) < LEAST_FRAMES:
-            raise KfvoError(f'{sequence.name}: expected at least {LEAST_FRAMES} frames with '
-                            f'ground truth to learn from, came {len(drive)}')
-        return drive
+            encoded = encode_sequence(SequenceVariant(source, augmentation, number, stop),
+                                      backbone)
+        if len(encoded) < MIN_FRAMES:
+            raise KfvoError(f'{source.name}: expected at least {MIN_FRAMES} frames with '
+                            f'ground truth to learn from, came {len(encoded)}')
+        return encoded
 
-    def _key(self, text: str, augmentation: Augmentation | None, number: int) -> str:
-        """Return a name for the drive that no other has, in this version."""
-        path, camera = Path(text).expanduser(), self.reading.camera
-        reading = asdict(self.reading) | {
+    def _file_stem(self, text: str, augmentation: Augmentation | None, number: int) -> str:
+        """Return a file name that changes with the version, the inputs and the settings."""
+        path, camera = Path(text).expanduser(), self.sequence_options.camera
+        options = asdict(self.sequence_options) | {
             'camera': camera and asdict(read_camera_info(Path(camera)))}
-        what = {'version': __version__, 'text': str(path.resolve()) if path.exists() else text,
-                'files': _files_of(path) if path.exists() else [],
-                'reading': reading, 'number': number, 'about': self.about,
-                'augmentation': augmentation and asdict(augmentation)}
-        digest = hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
+        identity = {'version': __version__,
+                    'text': str(path.resolve()) if path.exists() else text,
+                    'files': _files_of(path) if path.exists() else [],
+                    'reading': options, 'number': number, 'about': self.settings,
+                    'augmentation': augmentation and asdict(augmentation)}
+        digest = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()
         return f'{path.name[:32].replace(":", "-")}-{digest[:16]}'
 
 
 @dataclass(frozen=True)
 class CachedSequences(abc.Sequence[EncodedSequence]):
-    """Sequences of an archive, each asked for when its turn comes: not all images at once."""
+    """Sequences of a cache, each loaded when accessed: not all images at once."""
 
-    archive: EncodedSequenceCache
+    cache: EncodedSequenceCache
     texts: tuple[str, ...]
 
     def __len__(self) -> int:
         return len(self.texts)
 
     def __getitem__(self, index: Any) -> Any:
-        return self.archive.whole(self.texts[index])
+        return self.cache.sequence(self.texts[index])
 
 
 def _files_of(path: Path) -> list[tuple[str, int, int]]:
-    """Return name, size and time of change [ns] of all files that a sequence may be read from.
+    """Return name, size and modification time [ns] of all files that a sequence may consist of.
 
-    Beside its own path that is a calibration, and the true poses of KITTI.
+    Outside its own path these are a calibration and the true poses of KITTI.
     """
     path = Path(os.path.abspath(path))
     files = (path, *path.rglob('*'), path.parent / CALIBRATION_FILE,

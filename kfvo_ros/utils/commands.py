@@ -1,10 +1,11 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the commands share: how their arguments look, and how each of them ends."""
+"""Shared by all commands: the parser, lists of values, errors and exit status."""
 
 from __future__ import annotations
 
 import argparse
+import importlib.metadata
 import logging
 import os
 import re
@@ -14,21 +15,14 @@ from contextlib import contextmanager
 
 from kfvo_ros import __version__
 from kfvo_ros.errors import KfvoError, reason_of
-from kfvo_ros.utils.process import raise_on_signals
+from kfvo_ros.utils.signals import raise_on_signals
 
-PIP_NAMES = {'cv2': 'opencv-python-headless', 'mcap': 'mcap', 'numba': 'numba',
-             'numpy': 'numpy', 'poselib': 'poselib', 'rosbags': 'rosbags',
-             'safetensors': 'safetensors', 'threadpoolctl': 'threadpoolctl', 'tqdm': 'tqdm',
-             'yaml': 'PyYAML'}
-"""The modules of setup.py's install_requires, by the name they are imported under."""
-OPTIONAL_PIP_NAMES = {'matplotlib': 'matplotlib', 'torch': 'torch', 'PIL': 'pillow',
-                      'huggingface_hub': 'huggingface-hub', 'gymnasium': 'gymnasium',
-                      'stable_baselines3': 'stable-baselines3', 'tensorboard': 'tensorboard'}
-"""Modules that one command needs: an extra of setup.py brings them."""
+DISTRIBUTIONS = {'cv2': 'opencv-python-headless', 'yaml': 'PyYAML', 'PIL': 'pillow'}
+"""Distributions whose names are not those of their modules."""
 ROS_MODULES = frozenset(('rclpy', 'rcl_interfaces', 'rosgraph_msgs', 'sensor_msgs', 'nav_msgs',
                          'geometry_msgs', 'diagnostic_msgs', 'std_msgs', 'std_srvs',
                          'builtin_interfaces'))
-"""What a ROS 2 installation brings; setup.py has it as wheels, under the extra ``ros``."""
+"""Modules of a ROS 2 installation; the extra ``ros`` of setup.py brings them as wheels."""
 MAX_SEEDS = 10_000
 RANGE = re.compile(r'(synthetic):([0-9]{1,10})-([0-9]{1,10})((?::[a-z]+)?)')
 
@@ -43,11 +37,11 @@ def make_parser(command: str, description: str, examples: str = '') -> argparse.
 
 def run_command(command: str, body: Callable[[list[str]], None], argv: list[str] | None,
                 until_stopped: bool = False) -> int:
-    """Call `body` with the arguments, None for this process's own; return the exit status.
+    """Call `body` with the arguments (None: those of the process); return the exit status.
 
-    What a user can meet ends it in one line on stderr and status 1; whatever else is raised is
-    a mistake of ours and keeps its traceback. SIGINT and SIGTERM interrupt it, which is the
-    usual end, of status 0, of a command that runs `until_stopped`.
+    Errors that a user can cause end it with one line on stderr and status 1; any other exception
+    is a bug and keeps its traceback. SIGINT and SIGTERM interrupt it; for a command that runs
+    `until_stopped` this is the normal end, with status 0.
     """
     logging.basicConfig(format=f'{command}: %(levelname)s: %(message)s', level=logging.WARNING)
     raise_on_signals(even_ignored=until_stopped)
@@ -63,7 +57,7 @@ def run_command(command: str, body: Callable[[list[str]], None], argv: list[str]
         problem = str(missing_dependency(error))
     except KfvoError as error:
         problem = str(error)
-    except MemoryError as error:  # numpy tells for what, Python does not
+    except MemoryError as error:  # numpy says for which array
         problem = f'out of memory: {error}'.rstrip(': ')
     except OSError as error:
         problem = f'{error.filename or ""}: {reason_of(error)}'.lstrip(': ')
@@ -73,23 +67,22 @@ def run_command(command: str, body: Callable[[list[str]], None], argv: list[str]
 
 @contextmanager
 def _output_written() -> Iterator[None]:
-    """Write out what was printed while it can still be told that nobody can take it."""
+    """Flush stdout at the end, so that a closed pipe or full disk is an error with a message."""
     try:
         yield
     finally:
         try:
             print(end='', flush=True)
         except OSError:
-            # Python would try again at its exit, and fail with a traceback.
+            # Python flushes again at exit and would print a traceback.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             raise
 
 
 def missing_dependency(error: ImportError) -> KfvoError:
-    """Return the one line to show for a module that is missing, or is there and does not load.
+    """Return the one line to show for a module that is missing or cannot be imported.
 
-    Raises the error itself when no package of setup.py would bring the module: that is a
-    mistake of ours, not of the installation.
+    Raises the error itself if kfvo_ros does not require the module: then it is a bug.
     """
     module = (error.name or '').partition('.')[0]
     problem = 'is missing' if isinstance(error, ModuleNotFoundError) else \
@@ -97,10 +90,20 @@ def missing_dependency(error: ImportError) -> KfvoError:
     if module in ROS_MODULES:
         return KfvoError(f"{module} {problem}: source /opt/ros/jazzy/setup.bash, or pip install "
                          "'kfvo_ros[ros]' where there is none")
-    packages = PIP_NAMES | OPTIONAL_PIP_NAMES
-    if module not in packages:
+    distribution = DISTRIBUTIONS.get(module, module.replace('_', '-'))
+    known = _requirements()
+    if module == 'kfvo_ros' or (known and distribution.lower() not in known):
         raise error
-    return KfvoError(f'{module} {problem}: pip install {packages[module]}')
+    return KfvoError(f'{module} {problem}: pip install {distribution}')
+
+
+def _requirements() -> set[str]:
+    """Return the distributions that kfvo_ros requires, in lower case; none if not installed."""
+    try:
+        lines = importlib.metadata.requires('kfvo_ros') or []
+    except importlib.metadata.PackageNotFoundError:
+        lines = []
+    return {re.split(r'[^\w.-]', line, maxsplit=1)[0].replace('_', '-').lower() for line in lines}
 
 
 def parse_names(text: str, what: str, known: Iterable[str]) -> tuple[str, ...]:
@@ -122,7 +125,7 @@ def parse_numbers(text: str, what: str, least: int = 0) -> tuple[int, ...]:
 
 
 def expand_ranges(texts: Iterable[str]) -> tuple[str, ...]:
-    """Return the sequences one by one: ``synthetic:A-B`` are the seeds from A to B.
+    """Return the sequences, each ``synthetic:A-B[:STYLE]`` replaced by one for every seed.
 
     Raises KfvoError for a range that is empty or too long.
     """

@@ -1,154 +1,174 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Dataclasses from what a YAML file says, every key of them and no other."""
+"""One schema for every option: a field of a frozen dataclass, declared and checked once.
+
+`option` declares a field with its description, range and choices; `options_of` reads a dataclass
+back as a list of `Option`. From that list follow command lines (`add_arguments`,
+`from_arguments`, `to_arguments`), YAML files (`from_mapping`, `to_mapping`), ROS parameters
+(kfvo_ros.ros.parameters) and launch arguments.
+"""
 
 from __future__ import annotations
 
 import argparse
+import functools
 import types
 import typing
 from collections.abc import Mapping
-from dataclasses import MISSING, Field, field, fields, is_dataclass
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from typing import Any, TypeVar
 
 from kfvo_ros.errors import KfvoError
 
-Section = TypeVar('Section')
-Range = tuple[float | None, float | None]
-KINDS = {int: 'a whole number', float: 'a number', bool: 'true or false', str: 'a word'}
 Options = TypeVar('Options')
+Range = tuple[float | None, float | None]
+NO_RANGES: Mapping[str, Range] = types.MappingProxyType({})
+KINDS = {int: 'a whole number', float: 'a number', bool: 'true or false', str: 'text'}
+TRUE, FALSE = ('true', 'yes', 'on', '1'), ('false', 'no', 'off', '0')
 
 
-def required(least: float | None = None, most: float | None = None, choices: tuple[str, ...] = (),
-             within: Mapping[str, Range] = types.MappingProxyType({})) -> Any:
-    """Declare a field without a default: its range, or what it may be.
+def option(default: Any = MISSING, description: str = '', choices: tuple[str, ...] = (),
+           least: float | None = None, most: float | None = None, bare: Any = None,
+           flag: str = '', key: str = '', within: Mapping[str, Range] = NO_RANGES) -> Any:
+    """Declare one field of an options dataclass.
 
-    `within` are ranges of the fields of a field that is a dataclass, and declares none itself.
+    `bare` is the value of a command line option that is given without one; `flag` and `key` are
+    the names on command lines and in YAML files where they differ from the field's; `within` are
+    ranges for the fields of a nested dataclass that declares none itself.
     """
-    return field(metadata={'least': least, 'most': most, 'choices': choices, 'within': within})
+    return field(default=default, metadata={
+        'description': description, 'choices': choices, 'least': least, 'most': most,
+        'bare': bare, 'flag': flag, 'key': key, 'within': within})
 
 
-def from_mapping(kind: type[Section], mapping: Any, file: str, place: str = '',
-                 within: Mapping[str, Range] = types.MappingProxyType({})) -> Section:
-    """Build the dataclass; raises KfvoError naming the key, what was expected and what came.
+required = functools.partial(option, MISSING, '')
+"""Declare a field without default or description: a key that a YAML file must have."""
 
-    A field may be of a dataclass itself; one that may be None is null in the file.
+
+@dataclass(frozen=True)
+class Option:
+    """One field of an options dataclass: its declaration, and the type that its values have.
+
+    ``kind`` is the type without None and, of a tuple, that of its elements.
     """
-    names = [declared.name for declared in fields(kind)]  # type: ignore[arg-type]
-    if not isinstance(mapping, dict):
-        raise _unexpected(file, place, f'the keys {", ".join(names)}', mapping)
-    for name in mapping:
-        if name not in names:
-            raise _unexpected(file, place, f'the keys {", ".join(names)}', name)
-    hints = typing.get_type_hints(kind)
-    values = {}
-    for declared in fields(kind):  # type: ignore[arg-type]
-        inner = f'{place}.{declared.name}'.lstrip('.')
-        if declared.name not in mapping:
-            raise KfvoError(f'{file}: expected the key {inner}, it is missing')
-        least, most = within.get(declared.name, (None, None))
-        values[declared.name] = _value(
-            hints[declared.name], declared.metadata or {'least': least, 'most': most},
-            mapping[declared.name], file, inner)
-    return kind(**values)
 
+    name: str
+    kind: type[Any]
+    default: Any
+    may_be_none: bool
+    is_list: bool
+    description: str = ''
+    choices: tuple[str, ...] = ()
+    least: float | None = None
+    most: float | None = None
+    bare: Any = None
+    flag: str = ''
+    key: str = ''
+    within: Mapping[str, Range] = field(default_factory=dict)
 
-def _value(hint: Any, meta: Any, value: Any, file: str, place: str) -> Any:
-    """Return the value as its field wants it."""
-    choices = typing.get_args(hint)
-    if types.NoneType in choices:
-        if value is None:
+    @property
+    def expected(self) -> str:
+        """What a value may be, in words."""
+        if self.is_list:
+            return 'a list of words'
+        if self.choices:
+            return f'one of {", ".join(self.choices)}'
+        ends = [f'at {word} {end:.12g}' for word, end in (('least', self.least),
+                                                          ('most', self.most)) if end is not None]
+        return f'{KINDS[self.kind]}{" of " if ends else ""}{" and ".join(ends)}'
+
+    def check(self, value: Any) -> Any:
+        """Return a value in the type of the field; ValueError with what was expected and came."""
+        if value is None and self.may_be_none:
             return None
-        hint = next(choice for choice in choices if choice is not types.NoneType)
-    if is_dataclass(hint):
-        return from_mapping(typing.cast('type[Any]', hint), value, file, place, meta['within'])
-    if hint == tuple[str, ...]:
-        if not isinstance(value, list) or not all(isinstance(each, str) for each in value):
-            raise _unexpected(file, place, 'a list of words', value)
-        return tuple(value)
-    if hint is float and not isinstance(value, bool):
-        value = _number(value)
-    if type(value) is not hint or not _within(value, meta):
-        raise _unexpected(file, place, _wanted(hint, meta), value)
-    return value
+        if self.is_list:
+            if not isinstance(value, (list, tuple)) or not all(
+                    isinstance(each, self.kind) for each in value):
+                raise self.refusal(value)
+            return tuple(value)
+        checked = float(value) if self.kind is float and type(value) is int else value
+        if type(checked) is not self.kind or not self._allows(checked):
+            raise self.refusal(value)
+        return checked
 
-
-def _number(value: Any) -> Any:
-    """Return a float where one is meant: YAML 1.1 takes 1 for an integer, 3e-4 for a word."""
-    try:
-        return float(value)
-    except (TypeError, ValueError, OverflowError):
+    def parse(self, text: str) -> Any:
+        """Return the value of a text (an element, of a list); raises as `check` does."""
+        value: Any = text
+        if self.kind is bool:
+            value = {**dict.fromkeys(TRUE, True), **dict.fromkeys(FALSE, False)}.get(text.lower())
+        elif self.kind is not str:
+            try:
+                value = self.kind(text)
+            except (ValueError, OverflowError):
+                raise self.refusal(text) from None
+        if value is None or not self._allows(value):
+            raise self.refusal(text)
         return value
 
+    def refusal(self, value: Any) -> ValueError:
+        """Return the error that names what was expected and what came."""
+        return ValueError(f'expected {self.expected}, came {value!r}')
 
-def _within(value: Any, meta: Any) -> bool:
-    if meta.get('choices'):
-        return value in meta['choices']
-    least, most = meta.get('least'), meta.get('most')
-    return (least is None or value >= least) and (most is None or value <= most)
-
-
-def _wanted(hint: Any, meta: Any) -> str:
-    """Return what a field may be, in words."""
-    if meta.get('choices'):
-        return f'one of {", ".join(meta["choices"])}'
-    ends = [f'{word} {meta[end]:g}' for word, end in (('at least', 'least'), ('at most', 'most'))
-            if meta.get(end) is not None]
-    return f'{KINDS[hint]} {" and ".join(ends)}'.rstrip()
+    def _allows(self, value: Any) -> bool:
+        """Whether a value of the right type is one of the choices or within the range."""
+        if self.choices:
+            return value in self.choices
+        return ((self.least is None or value >= self.least)
+                and (self.most is None or value <= self.most))
 
 
-def _unexpected(file: str, place: str, wanted: str, came: Any) -> KfvoError:
-    return KfvoError(f'{file}: {f"{place}: " if place else ""}expected {wanted}; came {came!r}')
+@functools.cache
+def options_of(kind: type[Any]) -> tuple[Option, ...]:
+    """Return the options that an options dataclass declares, in order."""
+    hints = typing.get_type_hints(kind)
+    found = []
+    for declared in fields(kind):
+        parts = typing.get_args(hints[declared.name]) or (hints[declared.name],)
+        of_interest = [part for part in parts if part not in (types.NoneType, Ellipsis)]
+        is_list = typing.get_origin(hints[declared.name]) is tuple
+        found.append(Option(declared.name, of_interest[0], declared.default,
+                            types.NoneType in parts, is_list, **declared.metadata))
+    return tuple(found)
 
 
-def option(default: Any, description: str, choices: tuple[str, ...] = (),
-           least: float | None = None, most: float | None = None, bare: Any = None,
-           flag: str = '') -> Any:
-    """Declare one field: its default, what it does, what it may be, and what no value means.
-
-    `flag` is its name on command lines, if another than the field's.
-    """
-    return field(default=default, metadata={'description': description, 'choices': choices,
-                                            'least': least, 'most': most, 'bare': bare,
-                                            'flag': flag})
+# Command lines
 
 
 def add_arguments(parser: argparse.ArgumentParser, options: type[Any],
                   without: tuple[str, ...] = ()) -> None:
     """Add one ``--name`` for each field of an options dataclass, `without` some of them."""
     group = parser.add_argument_group((options.__doc__ or '').splitlines()[0].rstrip('.'))
-    for declared in fields(options):
+    for declared in options_of(options):
         if declared.name in without:
             continue
-        meta = declared.metadata
-        about: dict[str, Any] = {'help': meta['description'], 'default': declared.default}
-        if isinstance(declared.default, bool):
-            about |= {'action': 'store_true'}
+        keywords: dict[str, Any] = {'help': declared.description, 'default': declared.default}
+        if declared.kind is bool:
+            keywords['action'] = 'store_true'
         else:
-            about |= {'choices': meta['choices'] or None,
-                      'metavar': None if meta['choices'] else declared.name.upper(),
-                      'type': _parser_of(options, declared.name, meta)}
+            keywords |= {'type': functools.partial(_parse_argument, declared),
+                         'metavar': f'{{{",".join(declared.choices)}}}' if declared.choices
+                         else declared.name.upper()}
             if declared.default not in (None, MISSING, ()):
-                about['help'] += ' (default: %(default)s)'
-        if isinstance(declared.default, tuple):
-            about |= {'action': 'append', 'default': None}
-        if meta['bare'] is not None:
-            about |= {'nargs': '?', 'const': meta['bare']}
-        group.add_argument(_flag(declared), dest=declared.name, **about)
+                keywords['help'] += ' (default: %(default)s)'
+        if declared.is_list:
+            keywords |= {'action': 'append', 'default': None}
+        if declared.bare is not None:
+            keywords |= {'nargs': '?', 'const': declared.bare}
+        group.add_argument(_flag(declared), dest=declared.name, **keywords)
 
 
 def from_arguments(options: type[Options], arguments: argparse.Namespace) -> Options:
-    """Build the dataclass from parsed arguments; what was left out is the default."""
+    """Build the dataclass from parsed arguments; what is missing there has its default."""
     values = {declared.name: getattr(arguments, declared.name, None)
-              for declared in fields(options)}  # type: ignore[arg-type]
+              for declared in options_of(options)}
     return options(**{name: tuple(value) if isinstance(value, list) else value
                       for name, value in values.items() if value is not None})
 
 
 def to_arguments(options: Any) -> list[str]:
-    """Return the command line that gives these options; defaults stay unsaid."""
+    """Return the command line that gives these options; defaults are left out."""
     arguments = []
-    for declared in fields(options):
+    for declared in options_of(type(options)):
         value = getattr(options, declared.name)
         if value == declared.default:
             continue
@@ -161,35 +181,79 @@ def to_arguments(options: Any) -> list[str]:
     return arguments
 
 
-def type_of(options: type[Any], name: str) -> type[Any]:
-    """Return the type of a field, that of its elements if it is a tuple, without None."""
-    hint = typing.get_type_hints(options)[name]
-    return next(part for part in typing.get_args(hint) or (hint,) if part is not types.NoneType)
+def _flag(declared: Option) -> str:
+    return f'--{(declared.flag or declared.name).replace("_", "-")}'
 
 
-def _flag(declared: Field[Any]) -> str:
-    return f'--{(declared.metadata["flag"] or declared.name).replace("_", "-")}'
+def _parse_argument(declared: Option, text: str) -> Any:
+    """Return the value of a text; raises what argparse reports."""
+    try:
+        return declared.parse(text)
+    except ValueError as error:
+        hint = '' if declared.bare is None else \
+            '; without a value it must not stand before another argument'
+        raise argparse.ArgumentTypeError(f'{error}{hint}') from error
 
 
-def _parser_of(options: type[Any], name: str, meta: Any) -> Any:
-    """Return a function from text to the field's type, within its range."""
-    kind = type_of(options, name)
+# YAML files
 
-    def parse(text: str) -> Any:
-        """Return the value of a text; raises what argparse reports."""
-        try:
-            value = kind(text)
-        except ValueError as error:
-            if meta['bare'] is None:
-                raise
-            raise argparse.ArgumentTypeError(
-                f'invalid {kind.__name__} value: {text!r}; without a value it must not stand '
-                'before another argument') from error
-        if kind is not str and not (meta['least'] is None or value >= meta['least']):
-            raise argparse.ArgumentTypeError(f'expected at least {meta["least"]}, came {text}')
-        if kind is not str and not (meta['most'] is None or value <= meta['most']):
-            raise argparse.ArgumentTypeError(f'expected at most {meta["most"]}, came {text}')
-        return value
 
-    parse.__name__ = kind.__name__
-    return parse
+def from_mapping(options: type[Options], mapping: Any, file: str, place: str = '',
+                 within: Mapping[str, Range] = NO_RANGES) -> Options:
+    """Build the dataclass from a mapping that has every key and no other.
+
+    Fields may be dataclasses themselves; null stands for None. Raises KfvoError with `file`, the
+    `place` of the key in it, what was expected and what came.
+    """
+    declared = {each.key or each.name: each for each in options_of(options)}
+    if not isinstance(mapping, dict):
+        raise _unexpected(file, place, declared, mapping)
+    for name in mapping:
+        if name not in declared:
+            raise _unexpected(file, place, declared, name)
+    values = {}
+    for name, each in declared.items():
+        inner = f'{place}.{name}'.lstrip('.')
+        if name not in mapping:
+            raise KfvoError(f'{file}: expected the key {inner}, it is missing')
+        values[each.name] = _value_of(each, mapping[name], file, inner, within.get(each.name))
+    return options(**values)
+
+
+def to_mapping(options: Any) -> dict[str, Any]:
+    """Return the mapping that `from_mapping` takes, nested dataclasses included."""
+    mapping = {}
+    for each in options_of(type(options)):
+        value = getattr(options, each.name)
+        mapping[each.key or each.name] = to_mapping(value) if is_dataclass(value) else value
+    return mapping
+
+
+def _value_of(declared: Option, value: Any, file: str, place: str, range_: Range | None) -> Any:
+    """Return a value of a YAML file in the type of its field."""
+    if is_dataclass(declared.kind):
+        if value is None and declared.may_be_none:
+            return None
+        return from_mapping(declared.kind, value, file, place, declared.within)
+    if range_ is not None:
+        declared = Option(declared.name, declared.kind, declared.default, declared.may_be_none,
+                          declared.is_list, least=range_[0], most=range_[1])
+    if declared.kind is float and isinstance(value, str):
+        value = _number(value)
+    try:
+        return declared.check(value)
+    except (ValueError, OverflowError):
+        raise KfvoError(f'{file}: {place}: expected {declared.expected}; came {value!r}') from None
+
+
+def _number(text: str) -> Any:
+    """Return the number of a text, or the text: YAML 1.1 reads 3e-4 as a word."""
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def _unexpected(file: str, place: str, declared: Mapping[str, Option], came: Any) -> KfvoError:
+    return KfvoError(f'{file}: {f"{place}: " if place else ""}expected the keys '
+                     f'{", ".join(declared)}; came {came!r}')

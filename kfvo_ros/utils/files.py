@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Files that are there in full or not at all."""
+"""Files: atomic writes, YAML, text tables, and the files of the config folder."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from kfvo_ros.errors import KfvoError, reason_of
 
 MALFORMED_YAML = (yaml.YAMLError, ValueError, LookupError, AttributeError, ArithmeticError,
                   RecursionError)
-"""What PyYAML raises, its constructors of dates and numbers too."""
+"""What PyYAML raises, including its constructors of dates and numbers."""
 Row = TypeVar('Row')
 CONFIG_FOLDER = Path('share', 'kfvo_ros', 'config')
 
 
 @contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
-    """Give a path beside this one to write to; what was written takes this one's place.
+    """Yield a draft path beside `path`; at the end the draft replaces it in one step.
 
-    Whoever reads the file meanwhile, and whatever goes wrong, the old one is there until then.
+    Readers see the old file until then, and keep it when an error is raised.
     """
     draft = path.with_name(f'.{path.name}.{os.getpid()}')
     try:
@@ -38,9 +38,9 @@ def atomic_write(path: Path) -> Iterator[Path]:
 
 
 def read_yaml(path: Path, what: str = '') -> Any:
-    """Return what a file holds; raises KfvoError that it cannot be read, and as `what`.
+    """Return the content of a YAML file; raises KfvoError, with `what` before the path.
 
-    Lines that start with % are left out: OpenCV's ``%YAML:1.0`` is no YAML.
+    Lines that start with % are skipped: OpenCV's ``%YAML:1.0`` is not valid YAML.
     """
     try:
         lines = path.read_text(encoding='utf-8').splitlines()
@@ -52,8 +52,8 @@ def read_yaml(path: Path, what: str = '') -> Any:
 def read_rows(path: Path, form: str, parse: Callable[[str], Row]) -> list[Row]:
     """Parse every line that is neither empty nor a ``#`` comment.
 
-    `parse` raises ValueError or IndexError at a line that is not of the `form`, which is for
-    people; that, and a file that cannot be read, becomes a KfvoError naming file and line.
+    `parse` raises ValueError or IndexError for a line that does not have the `form`, which is
+    shown to the user. Raises KfvoError with file and line for that, and for an unreadable file.
     """
     try:
         lines = path.read_text(encoding='utf-8').splitlines()
@@ -88,11 +88,14 @@ def parse_pose(fields: Iterable[str]) -> list[float]:
 
 
 def find_config(name: str) -> Path:
-    """Return the file of this path, else that of the config folder, else the path as it is."""
+    """Return the file at this path, else the one of the config folder, else the path itself.
+
+    The config folder is that of the checkout or of the installation (share/kfvo_ros/config).
+    """
     given = Path(name).expanduser()
     if given.exists() or given.name != name:
         return given
-    package = Path(__file__).resolve().parent
+    package = Path(__file__).resolve().parents[1]
     # colcon's prefix holds lib/pythonX/site-packages/kfvo_ros.
     prefixes = [*os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep), sys.prefix,
                 *map(str, package.parents[2:4])]

@@ -1,12 +1,12 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""ATE, RPE, trivial estimates and amounts of motion by hand."""
+"""ATE, RPE, trivial baselines and amounts of motion by hand."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from trajectories import EPOCH_NS, along_x, freiburg1_rpy, trajectory, wandering
+from trajectories import EPOCH_NS, along_x, freiburg1_rpy, random_walk, trajectory
 
 from kfvo_ros import geometry
 from kfvo_ros.evaluation.metrics import (
@@ -40,7 +40,7 @@ def test_ate_by_hand():
 
 
 def test_ate_is_zero_in_another_world():
-    truth = wandering(3)
+    truth = random_walk(3)
     world = Similarity(20.0, geometry.exp_so3([1.0, 2.0, 0.5]), np.array([1.0, 2.0, 3.0]))
     estimate = Trajectory(truth.stamps_ns, world.transform_poses(truth.poses))
     error = absolute_trajectory_error(estimate, truth)
@@ -59,7 +59,7 @@ def test_rpe_by_hand():
     estimate = trajectory([[1.1 * i, 0, 0] for i in range(6)], rotation_vectors=turns)
     one = relative_pose_error(estimate, truth, 1, 'frames', with_scale=False)
     np.testing.assert_allclose(one.rot_deg, [2.0] * 5)
-    # The i-th step is seen turned by 2i degrees: chord between 1 and 1.1 at that angle.
+    # The i-th step is rotated by 2i degrees: the chord between 1 and 1.1 at that angle.
     expected = [np.hypot(1.1 * np.cos(a) - 1, 1.1 * np.sin(a)) for a in turns[:5, 2]]
     np.testing.assert_allclose(one.trans, expected)
     assert one.trans_rmse == pytest.approx(np.sqrt(np.mean(np.square(expected))))
@@ -97,15 +97,15 @@ def test_jittering_stamps_do_not_change_the_pairs():
     found = relative_pose_error(constant_position(jittered.stamps_ns), jittered, 1.0, 'seconds')
     expected = relative_pose_error(constant_position(regular.stamps_ns), regular, 20, 'frames')
     np.testing.assert_array_equal(found.trans[:count - 20], expected.trans)
-    # The last pose also serves the two starts that would end 50 and 100 ms later.
+    # The last pose also ends the pairs of two starts that would end 50 and 100 ms later.
     assert len(found.trans) == count - 18
 
 
-# Trivial estimates
+# Trivial baselines
 
 
 def test_constant_position_scores_the_spread_of_the_truth():
-    truth = wandering(2)
+    truth = random_walk(2)
     error = absolute_trajectory_error(constant_position(truth.stamps_ns), truth)
     spread = truth.positions - truth.positions.mean(axis=0)
     assert error.rmse == pytest.approx(np.sqrt(np.mean(np.sum(spread ** 2, axis=1))))
@@ -115,7 +115,7 @@ def test_constant_position_scores_the_spread_of_the_truth():
 
 
 def test_straight_line_scores_the_linear_regression_over_time():
-    truth = wandering(2)
+    truth = random_walk(2)
     seconds = (truth.stamps_ns - truth.stamps_ns[0]) / 1e9
     basis = np.column_stack([seconds, np.ones(len(truth))])
     residual = truth.positions - basis @ np.linalg.lstsq(basis, truth.positions, rcond=None)[0]
@@ -133,14 +133,14 @@ def test_straight_line_fits_constant_speed_at_irregular_stamps():
     assert absolute_trajectory_error(straight_line(stamps_ns), truth).rmse < 1e-12
 
 
-def test_trivial_estimates_of_freiburg1_rpy(data_path):
+def test_trivial_baselines_of_freiburg1_rpy(data_path):
     stamps_ns, truth = freiburg1_rpy(data_path)
     for estimate, metres in ((constant_position, 0.064), (straight_line, 0.049)):
         rmse = absolute_trajectory_error(estimate(stamps_ns), truth).rmse
         assert rmse == pytest.approx(metres, abs=0.0005)
 
 
-# How much it moved
+# Amounts of motion
 
 
 def test_extent_is_measured_from_the_start():

@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The geometric backbone against its contract and against the truth."""
+"""Test the geometric backbone against its contract and the true motion."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ import pytest
 from odometry_scenes import (
     CAMERA,
     PointCloud,
+    certain_tracks,
     frames_of,
     moving_poses,
     run,
-    sure,
     turning_poses,
     window,
 )
@@ -27,23 +27,23 @@ from kfvo_ros.keyframes.heuristics import Survival
 from kfvo_ros.odometry import window_prior
 from kfvo_ros.odometry.keyframe_odometry import KeyframeOdometry
 from kfvo_ros.sequences.synthetic.sequence import SyntheticSequence
-from kfvo_ros.tracking.tracker import common
+from kfvo_ros.tracking.tracker import common_pixels
 
 
-def followed(backbone: GeometricBackbone, poses: np.ndarray, noise: float) -> Window:
-    """Return the window one frame after the first, with what the first one found as a hint."""
+def second_window(backbone: GeometricBackbone, poses: np.ndarray, noise: float) -> Window:
+    """Return the window one frame after the first, with the first estimate as its prior."""
     first = window(poses[:-1], noise=noise, backbone=backbone)
     estimate = backbone.estimate([first])[0]
     newest = PointCloud(0, noise=noise).encode(len(poses) - 1, poses[-1])
-    previous = WindowPrior(estimate.T_anchor_frame, estimate.T_anchor_frame[-1], estimate.points,
+    prior = WindowPrior(estimate.T_anchor_frame, estimate.T_anchor_frame[-1], estimate.points,
                            estimate.memory)
-    return Window(first.stream, (*first.frames, newest), previous)
+    return Window(first.stream, (*first.frames, newest), prior)
 
 
 def arrays_of(estimate: Estimate) -> list[np.ndarray]:
     points = estimate.points
     return [estimate.T_anchor_frame, estimate.covariance, points.ids, points.positions,
-            points.information, estimate.signals, estimate.memory.T_anchor_view]
+            points.information, estimate.signals, estimate.memory.T_anchor_frame]
 
 
 def assert_same(one: Estimate, other: Estimate) -> None:
@@ -52,28 +52,28 @@ def assert_same(one: Estimate, other: Estimate) -> None:
         assert a.tobytes() == b.tobytes()
 
 
-def test_a_track_that_is_wrong_once_is_not_believed_at_all():
+def test_track_with_one_wrong_observation_is_an_outlier():
     backbone = GeometricBackbone()
     clean = window(moving_poses(8), backbone=backbone)
     known = backbone.estimate([clean])[0].points.ids
-    view = clean.frames[3].payload
-    wrong = np.intersect1d(known, view.tracks.ids)[10]
+    frame = clean.frames[3].payload
+    wrong = np.intersect1d(known, frame.tracks.ids)[10]
     assert wrong in clean.frames[5].payload.tracks.ids
-    view.points[view.tracks.ids == wrong] += 5.0 / CAMERA.fx
+    frame.points[frame.tracks.ids == wrong] += 5.0 / CAMERA.fx
     left = backbone.estimate([clean])[0].points.ids
     assert np.array_equal(left, np.setdiff1d(known, [wrong]))
 
 
-def test_where_nothing_fits_noise_is_no_excuse():
-    """Bounds of outliers that grew with the noise for ever would let everything pass."""
+def test_window_without_any_fit_is_lost():
+    """Outlier bounds that grow with the noise without limit would accept everything."""
     backbone = GeometricBackbone()
     assert backbone.estimate([window(moving_poses(8), 0, 12.0, backbone)])[0].status is Status.LOST
 
 
-def test_many_windows_in_one_call_are_each_alone():
+def test_windows_in_one_call_are_independent():
     backbone = GeometricBackbone()
     a = window(moving_poses(8), 1, 0.3, backbone)
-    b = followed(backbone, moving_poses(8), 0.3)
+    b = second_window(backbone, moving_poses(8), 0.3)
     together = backbone.estimate([a, b])
     apart = backbone.estimate([a]) + backbone.estimate([b])
     for one, other in zip(together, apart, strict=True):
@@ -84,28 +84,28 @@ def test_many_windows_in_one_call_are_each_alone():
 
 def test_estimate_has_no_side_effects():
     backbone = GeometricBackbone()
-    hinted = followed(backbone, moving_poses(8), 0.3)
-    inputs = [array.copy() for frame in hinted.frames
+    with_prior = second_window(backbone, moving_poses(8), 0.3)
+    inputs = [array.copy() for frame in with_prior.frames
               for array in (frame.payload.points, frame.payload.tracks.pixels)]
-    before = hinted.previous.T_anchor_frame.copy(), hinted.previous.points.positions.copy()
-    first = backbone.estimate([hinted])[0]
+    before = with_prior.prior.T_anchor_frame.copy(), with_prior.prior.points.positions.copy()
+    first = backbone.estimate([with_prior])[0]
     kept = [array.copy() for array in arrays_of(first)]
-    assert_same(first, backbone.estimate([hinted])[0])
+    assert_same(first, backbone.estimate([with_prior])[0])
     for array, copy in zip(arrays_of(first), kept):
         assert np.array_equal(array, copy)
-    after = [array for frame in hinted.frames
+    after = [array for frame in with_prior.frames
              for array in (frame.payload.points, frame.payload.tracks.pixels)]
     assert all(np.array_equal(x, y) for x, y in zip(inputs, after))
-    assert np.array_equal(before[0], hinted.previous.T_anchor_frame)
-    assert np.array_equal(before[1], hinted.previous.points.positions)
+    assert np.array_equal(before[0], with_prior.prior.T_anchor_frame)
+    assert np.array_equal(before[1], with_prior.prior.points.positions)
 
 
 @pytest.mark.parametrize('frames', [2, 3, 8])
-@pytest.mark.parametrize('hinted', [False, True])
-def test_shapes_and_first_pose(frames, hinted):
-    backbone, poses = GeometricBackbone(), moving_poses(frames + hinted)
-    if hinted:
-        given = followed(backbone, poses, 0.3)
+@pytest.mark.parametrize('with_prior', [False, True])
+def test_shapes_and_first_pose(frames, with_prior):
+    backbone, poses = GeometricBackbone(), moving_poses(frames + with_prior)
+    if with_prior:
+        given = second_window(backbone, poses, 0.3)
     else:
         given = window(poses, noise=0.3, backbone=backbone)
     estimate, size = backbone.estimate([given])[0], len(poses)
@@ -150,8 +150,8 @@ def test_half_a_pixel_of_noise_stays_small():
     assert np.linalg.norm(scale * found[:, :3, 3] - truth[:, :3, 3], axis=1).max() < 0.03
 
 
-def test_a_start_before_a_wall_ends_at_the_right_one_of_two_motions():
-    """The first frames fit both; a start at the wrong one is left when later frames tell."""
+def test_start_before_a_wall_finds_the_right_one_of_two_motions():
+    """The first frames fit both; later frames resolve the ambiguity."""
     room = SyntheticSequence(77, 'mixed', 20)
     poses = room.ground_truth().trajectory.poses
     ended = run(room).poses
@@ -160,11 +160,11 @@ def test_a_start_before_a_wall_ends_at_the_right_one_of_two_motions():
     assert np.degrees(geometry.rotation_angle(wrong[:3, :3])) < 0.5
 
 
-def test_hint_keeps_the_unit_of_the_trajectory():
+def test_prior_keeps_the_unit_of_the_trajectory():
     backbone = GeometricBackbone()
-    hinted = followed(backbone, moving_poses(8), 0.2)
-    known = hinted.previous.T_anchor_frame
-    found = backbone.estimate([hinted])[0].T_anchor_frame
+    with_prior = second_window(backbone, moving_poses(8), 0.2)
+    known = with_prior.prior.T_anchor_frame
+    found = backbone.estimate([with_prior])[0].T_anchor_frame
     ratio = np.linalg.norm(found[1:7, :3, 3]) / np.linalg.norm(known[1:, :3, 3])
     assert abs(np.log(ratio)) < 0.02
 
@@ -182,8 +182,8 @@ def test_covariance_is_symmetric_and_positive(noise):
 
 
 @pytest.mark.parametrize('seed', range(3))
-def test_covariance_tells_that_turning_shows_no_scale(seed):
-    """Where it stands a turning camera knows to a share of the depth; of the scale nothing."""
+def test_covariance_of_a_turning_camera_includes_its_unknown_scale(seed):
+    """Its position is known relative to the depth, its scale is not."""
     backbone = GeometricBackbone()
     moving, turning = (
         backbone.estimate([window(poses, seed, 0.3, backbone)])[0]
@@ -209,8 +209,8 @@ def test_turning_is_held_and_its_rotation_right(noise):
                              )[0].status is Status.OK
 
 
-def test_a_frame_at_rest_is_not_held_where_the_window_moved():
-    """There is no parallax to the last keyframe, and enough to those before it."""
+def test_frame_at_rest_is_not_held_in_a_moving_window():
+    """It has no parallax to the last keyframe and enough to those before it."""
     poses, backbone = moving_poses(8), GeometricBackbone()
     poses[-1] = poses[-2]
     estimate = backbone.estimate([window(poses, noise=0.1, backbone=backbone)])[0]
@@ -219,33 +219,34 @@ def test_a_frame_at_rest_is_not_held_where_the_window_moved():
 
 
 @pytest.mark.parametrize('unit', [1e-4, 1e3])
-def test_a_window_is_the_same_in_any_unit(unit):
-    """A camera that starts far above a field lands in it; another starts at a wall."""
+def test_window_is_the_same_in_any_unit(unit):
+    """The first depth, and so the unit, may be much larger or smaller than later ones."""
     backbone = GeometricBackbone()
-    window = followed(backbone, moving_poses(8), 0.1)
+    window = second_window(backbone, moving_poses(8), 0.1)
     usual = backbone.estimate([window])[0]
-    hint = window.previous
-    elsewhere = replace(window, previous=WindowPrior(
-        window_prior.scale_poses(hint.T_anchor_frame, unit), window_prior.scale_poses(hint.T_anchor_latest, unit),
-        window_prior.transform_points(hint.points, np.eye(4), unit), hint.memory, unit))
+    prior = window.prior
+    elsewhere = replace(window, prior=WindowPrior(
+        window_prior.scale_poses(prior.T_anchor_frame, unit),
+        window_prior.scale_poses(prior.T_anchor_latest, unit),
+        window_prior.transform_points(prior.points, np.eye(4), unit), prior.memory, unit))
     other = backbone.estimate([elsewhere])[0]
     np.testing.assert_allclose(window_prior.scale_poses(other.T_anchor_frame, 1.0 / unit),
                                usual.T_anchor_frame, rtol=0.0, atol=1e-5)
 
 
-def test_a_frame_that_shares_nothing_is_lost_where_it_was():
+def test_frame_without_common_tracks_is_lost_at_the_latest_pose():
     backbone = GeometricBackbone()
-    hinted = followed(backbone, moving_poses(8), 0.2)
-    newest = hinted.frames[-1]
-    others = sure(newest.tracks.ids + 10_000, newest.tracks.pixels)
-    view = type(newest.payload)(7, others, newest.payload.points)
-    strange = type(newest)(newest.stamp_ns, newest.descriptor, view, others)
-    lost = backbone.estimate([Window(hinted.stream, (*hinted.frames[:-1], strange),
-                                     hinted.previous)])[0]
+    with_prior = second_window(backbone, moving_poses(8), 0.2)
+    newest = with_prior.frames[-1]
+    others = certain_tracks(newest.tracks.ids + 10_000, newest.tracks.pixels)
+    payload = type(newest.payload)(7, others, newest.payload.points)
+    unrelated = type(newest)(newest.stamp_ns, newest.descriptor, payload, others)
+    lost = backbone.estimate([Window(with_prior.stream, (*with_prior.frames[:-1], unrelated),
+                                     with_prior.prior)])[0]
     assert lost.status is Status.LOST
-    assert np.array_equal(lost.T_anchor_frame[:-1], hinted.previous.T_anchor_frame)
-    assert np.array_equal(lost.T_anchor_frame[-1], hinted.previous.T_anchor_latest)
-    ok = backbone.estimate([hinted])[0]
+    assert np.array_equal(lost.T_anchor_frame[:-1], with_prior.prior.T_anchor_frame)
+    assert np.array_equal(lost.T_anchor_frame[-1], with_prior.prior.T_anchor_latest)
+    ok = backbone.estimate([with_prior])[0]
     assert np.trace(lost.covariance[-1]) > 100.0 * np.trace(ok.covariance[-1])
     assert np.isfinite(lost.signals).all()
     assert len(lost.signals) == len(backbone.signal_names)
@@ -254,16 +255,16 @@ def test_a_frame_that_shares_nothing_is_lost_where_it_was():
 def test_signals_follow_the_motion():
     backbone = GeometricBackbone()
 
-    def told(poses):
+    def signals_of(poses):
         estimate = backbone.estimate([window(poses, noise=0.2, backbone=backbone)])[0]
         return dict(zip(backbone.signal_names, estimate.signals.tolist(), strict=True))
 
-    slow, fast, turning = told(moving_poses(8, 0.05)), told(moving_poses(8)), told(
-        turning_poses(8))
+    slow, fast, turning = map(signals_of, (moving_poses(8, 0.05), moving_poses(8),
+                                           turning_poses(8)))
     assert fast['flow'] > slow['flow']
-    before, after = common(*(frame.payload.tracks for frame in window(
+    before, after = common_pixels(*(frame.payload.tracks for frame in window(
         moving_poses(8), noise=0.2, backbone=backbone).frames[-2:]))
-    assert np.expm1(fast['flow']) == pytest.approx(  # as the policy optical_flow sees it
+    assert np.expm1(fast['flow']) == pytest.approx(  # the flow of the policy optical_flow
         np.linalg.norm(after - before, axis=1).mean())
     assert fast['parallax'] > 2.0 * turning['parallax']
     assert turning['rotation'] == pytest.approx(
@@ -294,6 +295,6 @@ def test_streams_of_one_backbone_do_not_disturb_each_other():
         assert np.stack([pair[index] for pair in interleaved]).tobytes() == alone.tobytes()
 
 
-def test_a_camera_is_needed():
+def test_open_without_a_camera_raises():
     with pytest.raises(KfvoError, match='calibrated camera'):
         GeometricBackbone().open(None)

@@ -32,7 +32,7 @@ def frames() -> tuple[Frame, ...]:
 def checked(frames: list[Frame] | tuple[Frame, ...], policy=Survival, **options) -> Run:
     """Run and assert what holds for any input whatever."""
     result = run(frames, policy(), **options)
-    assert [placed.stamp_ns for placed in result.placed] == [frame.stamp_ns for frame in frames]
+    assert [placed.stamp_ns for placed in result.final] == [frame.stamp_ns for frame in frames]
     for update in result.updates:
         assert np.isfinite(update.T_world_camera).all()
         assert np.isfinite(update.covariance).all()
@@ -41,7 +41,7 @@ def checked(frames: list[Frame] | tuple[Frame, ...], policy=Survival, **options)
     R = result.poses[:, :3, :3]
     np.testing.assert_allclose(R @ np.swapaxes(R, 1, 2), np.tile(np.eye(3), (len(R), 1, 1)),
                                atol=1e-9)
-    for pose, placed in zip(result.handed_out, result.placed):
+    for pose, placed in zip(result.emitted_poses, result.final):
         assert np.array_equal(pose, placed.T_world_camera)
     return result
 
@@ -153,7 +153,7 @@ def test_doubled_frames(frames):
     doubled = [frame.image for frame in frames[:20] for _ in range(2)]
     result = checked(restamped(doubled, frames[0].camera))
     assert 'lost' not in result.statuses
-    assert relative_error(Run([], result.placed[::2], []), list(range(20))) < 0.03
+    assert relative_error(Run([], result.final[::2], []), list(range(20))) < 0.03
 
 
 @pytest.mark.parametrize(('policy', 'noise'), [(EveryFrame, 0.0), (EveryFrame, 4.0), (Survival, 4.0)])

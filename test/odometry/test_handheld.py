@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 import pytest
-from odometry_scenes import RATE_NS, sure
+from odometry_scenes import RATE_NS, certain_tracks
 
 from kfvo_ros import geometry
 from kfvo_ros.backbones.base import Encoded
@@ -58,7 +58,7 @@ def tracks_of(rng: np.random.Generator, points: np.ndarray, T_world_camera: np.n
         count += len(born)
         rows = np.flatnonzero(ids >= 0)
         rows = rows[np.argsort(ids[rows])]
-        yield sure(ids[rows], pixels[rows] + noise * rng.normal(size=(len(rows), 2)))
+        yield certain_tracks(ids[rows], pixels[rows] + noise * rng.normal(size=(len(rows), 2)))
 
 
 def replay(tracks_in_turn: Iterable[Tracks]) -> Trajectory:
@@ -68,7 +68,7 @@ def replay(tracks_in_turn: Iterable[Tracks]) -> Trajectory:
     for index, tracks in enumerate(tracks_in_turn):
         encoded = Encoded(index * RATE_NS, np.zeros(48, dtype=np.float32),
                           FrameTracks(index, tracks, CAMERA.undistort(tracks.pixels)), tracks)
-        window = odometry.begin(Frame(encoded.stamp_ns, NO_IMAGE, CAMERA), encoded)
+        window = odometry.encode(Frame(encoded.stamp_ns, NO_IMAGE, CAMERA), encoded)
         odometry.integrate(None if window is None else backbone.estimate([window])[0])
         placed += odometry.commit(True, {}).final
     placed += odometry.finish()
@@ -144,7 +144,7 @@ def sliding(rng: np.random.Generator, tracks_in_turn: Iterable[Tracks]) -> Itera
     for tracks in tracks_in_turn:
         off = np.concatenate([off, np.zeros((tracks.ids.max() + 1 - len(off), 2))])
         off += 0.05 * rng.normal(size=off.shape)
-        yield sure(tracks.ids, tracks.pixels + off[tracks.ids])
+        yield certain_tracks(tracks.ids, tracks.pixels + off[tracks.ids])
 
 
 @pytest.mark.parametrize('seed', range(3))

@@ -39,13 +39,13 @@ def scripted(frames) -> Run:
 def test_every_frame_gets_one_pose_in_input_order(frames, survival, scripted):
     for result in (survival, scripted, run(frames[:20], EveryFrame())):
         stamps = [update.stamp_ns for update in result.updates]
-        assert [placed.stamp_ns for placed in result.placed] == stamps
+        assert [placed.stamp_ns for placed in result.final] == stamps
         assert stamps == [frame.stamp_ns for frame in frames[:len(stamps)]]
 
 
 def test_the_world_is_the_first_camera(survival):
     assert np.array_equal(survival.updates[0].T_world_camera, np.eye(4))
-    assert np.array_equal(survival.placed[0].T_world_camera, np.eye(4))
+    assert np.array_equal(survival.final[0].T_world_camera, np.eye(4))
 
 
 def test_trajectory_follows_the_truth(frames, survival):
@@ -74,7 +74,7 @@ def test_first_seven_are_keyframes_and_then_the_policy_decides(scripted):
     assert kept[:WINDOW_SIZE - 1] == [True] * (WINDOW_SIZE - 1)
     expected = list(itertools.islice(itertools.cycle(PATTERN), COUNT - WINDOW_SIZE + 1))
     assert kept[WINDOW_SIZE - 1:] == expected
-    assert [placed.is_keyframe for placed in scripted.placed] == kept
+    assert [placed.is_keyframe for placed in scripted.final] == kept
 
 
 def test_policy_sees_the_whole_window(frames):
@@ -94,22 +94,22 @@ def test_window_grows_to_its_size_and_no_further(frames, size, count):
     odometry = KeyframeOdometry(GeometricBackbone(), Scripted(*PATTERN * 12), None, size)
     sizes = []
     for frame in frames[:count]:
-        window = odometry.begin(frame)
+        window = odometry.encode(frame)
         estimate = None
         if window is not None:
             sizes.append(len(window.frames))
             assert window.frames[-1].stamp_ns == frame.stamp_ns
             estimate = odometry.backbone.estimate([window])[0]
-        decision = odometry.integrate(estimate)
-        odometry.commit(decision if isinstance(decision, bool)
-                        else odometry.policy.decide(decision), {})
+        step = odometry.integrate(estimate)
+        odometry.commit(step.keep if step.decision is None
+                        else odometry.policy.decide(step.decision), {})
     assert sizes == [min(n, size) for n in range(2, count + 1)]
 
 
 def test_final_poses_never_change(survival, scripted):
     for result in (survival, scripted):
-        assert len(result.handed_out) == COUNT
-        for pose, placed in zip(result.handed_out, result.placed):
+        assert len(result.emitted_poses) == COUNT
+        for pose, placed in zip(result.emitted_poses, result.final):
             assert pose.tobytes() == placed.T_world_camera.tobytes()
 
 
@@ -142,10 +142,10 @@ def test_dropped_frame_follows_its_keyframe(frames):
 def test_steps_one_by_one_are_process(frames, survival):
     odometry = KeyframeOdometry(GeometricBackbone(), Survival())
     for frame, expected in zip(frames[:25], survival.updates):
-        window = odometry.begin(frame)
+        window = odometry.encode(frame)
         estimate = odometry.backbone.estimate([window])[0] if window else None
-        decision = odometry.integrate(estimate)
-        keep = decision if isinstance(decision, bool) else odometry.policy.decide(decision)
+        step = odometry.integrate(estimate)
+        keep = step.keep if step.decision is None else odometry.policy.decide(step.decision)
         update = odometry.commit(keep, {})
         assert update.T_world_camera.tobytes() == expected.T_world_camera.tobytes()
         assert update.covariance.tobytes() == expected.covariance.tobytes()
@@ -166,11 +166,11 @@ def test_two_odometries_batched_on_one_backbone_equal_two_runs(frames, survival)
     odometries = [KeyframeOdometry(backbone, Survival()) for _ in range(2)]
     poses: list[list[np.ndarray]] = [[], []]
     for pair in zip(frames[:25], others):
-        windows = [odometry.begin(frame) for odometry, frame in zip(odometries, pair)]
+        windows = [odometry.encode(frame) for odometry, frame in zip(odometries, pair)]
         estimates = backbone.estimate(windows) if all(windows) else [None, None]
         for odometry, estimate, taken in zip(odometries, estimates, poses):
-            decision = odometry.integrate(estimate)
-            keep = decision if isinstance(decision, bool) else odometry.policy.decide(decision)
+            step = odometry.integrate(estimate)
+            keep = step.keep if step.decision is None else odometry.policy.decide(step.decision)
             taken.append(odometry.commit(keep, {}).T_world_camera)
     alone = [survival, run(others[:25])]
     for taken, result in zip(poses, alone):

@@ -11,10 +11,18 @@ import numpy as np
 import pytest
 
 from kfvo_ros import geometry
+from kfvo_ros.backbones.base import Status
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.odometry.factory import make_odometry
-from kfvo_ros.odometry.online import LEAST_VARIANCE, OnlineOdometry, TrajectoryLog, free_path
+from kfvo_ros.odometry.online import (
+    LEAST_VARIANCE,
+    SPREAD_MEMORY,
+    OnlineOdometry,
+    TrajectoryLog,
+    free_path,
+)
 from kfvo_ros.odometry.options import OdometryOptions
+from kfvo_ros.odometry.updates import FramePose, Keyframe, Update
 from kfvo_ros.sequences.base import Frame
 from kfvo_ros.sequences.synthetic.sequence import SyntheticSequence
 from kfvo_ros.trajectory import read_tum
@@ -102,3 +110,36 @@ def test_doubt_is_the_backbones_and_what_windows_disagreed_on():
         spreads.append(np.linalg.eigvalsh(spread))
     assert np.abs(spreads[:5]).max() < 1e-12
     assert min(spreads[-1]) > -1e-12 and max(spreads[-1]) > 1e-6
+
+
+def test_the_spread_between_windows_is_in_world_axes():
+    """A frame that faces sideways and is refined by a turn about the world's z."""
+
+    class Steps:
+        """Gives one frame, whose pose becomes final with a correction."""
+
+        pending: tuple = ()
+
+        def process(self, frame):
+            keyframe = Keyframe(None, None, 0, facing, np.zeros((6, 6)))
+            pose = FramePose(frame.stamp_ns, keyframe, np.eye(4), True)
+            self.pending = (pose,)
+            update = Update(frame.stamp_ns, facing, np.zeros((6, 6)), np.zeros((6, 6)), Status.OK,
+                            True, self.final, None, {})
+            keyframe.T_world_camera = correction @ facing
+            self.final = (pose,)
+            return update
+
+        final: tuple = ()
+
+    facing = geometry.make_transform(geometry.exp_so3(np.array([0.0, np.pi / 2, 0.0])),
+                                     np.array([0.0, 0.0, 0.0]))
+    correction = geometry.make_transform(geometry.exp_so3(np.array([0.0, 0.0, 0.1])),
+                                         np.array([0.2, 0.0, 0.0]))
+    online = OnlineOdometry(Steps(), TrajectoryLog())
+    online.process(Frame(1, np.zeros((2, 2), dtype=np.uint8), None))
+    pose = online.process(Frame(2, np.zeros((2, 2), dtype=np.uint8), None))
+    variances = np.diag(pose.covariance) - LEAST_VARIANCE
+    np.testing.assert_allclose(variances, SPREAD_MEMORY * np.array([0.04, 0, 0, 0, 0, 0.01]),
+                               atol=1e-12)
+    assert pose.covariance[0, 5] == pytest.approx(SPREAD_MEMORY * 0.2 * 0.1)

@@ -10,8 +10,10 @@ import pytest
 from kfvo_ros import geometry
 from kfvo_ros.backbones.base import Estimate, Points, WindowPrior
 from kfvo_ros.odometry.scale import (
+    LEAST_AGREEMENT,
     MIN_SHARED_POINTS,
     SCALE_RULES,
+    STANDSTILL,
     ScaleAligner,
     compare_depths,
     compare_translations,
@@ -43,7 +45,7 @@ def estimate(unit: float, with_points: bool = True, translations: float | None =
                     np.zeros(0, dtype=np.float32))
 
 
-def previous(with_points: bool = True) -> WindowPrior:
+def prior(with_points: bool = True) -> WindowPrior:
     return WindowPrior(poses(1.0)[:7], np.eye(4), points() if with_points else None)
 
 
@@ -54,36 +56,36 @@ def test_rules_are_those_of_the_paper_and_depth():
 @pytest.mark.parametrize(('rule', 'expected'), [('none', 1.0), ('translation', 2.5),
                                                 ('depth', 2.5)])
 def test_unit_of_a_window_is_found(rule, expected):
-    assert ScaleAligner(rule).align(estimate(2.5), previous()) == pytest.approx(expected)
+    assert ScaleAligner(rule).align(estimate(2.5), prior()) == pytest.approx(expected)
 
 
 def test_each_rule_looks_at_its_own_evidence():
     contradictory = estimate(2.0, translations=1.0 / 3.0)
-    assert ScaleAligner('depth').align(contradictory, previous()) == pytest.approx(2.0)
-    assert ScaleAligner('translation').align(contradictory, previous()) == pytest.approx(3.0)
+    assert ScaleAligner('depth').align(contradictory, prior()) == pytest.approx(2.0)
+    assert ScaleAligner('translation').align(contradictory, prior()) == pytest.approx(3.0)
 
 
 def test_depth_falls_back_to_translation_without_points():
     contradictory = estimate(2.0, with_points=False, translations=1.0 / 3.0)
-    assert ScaleAligner('depth').align(contradictory, previous(False)) == pytest.approx(3.0)
+    assert ScaleAligner('depth').align(contradictory, prior(False)) == pytest.approx(3.0)
     others = Estimate(contradictory.T_anchor_frame, contradictory.make_covariance,
                       points(0.5, first_id=1000), contradictory.signals)
-    assert ScaleAligner('depth').align(others, previous()) == pytest.approx(3.0)
+    assert ScaleAligner('depth').align(others, prior()) == pytest.approx(3.0)
 
 
 def test_standstill_keeps_the_last_scale():
     aligner = ScaleAligner('translation')
-    assert aligner.align(estimate(2.5), previous()) == pytest.approx(2.5)
+    assert aligner.align(estimate(2.5), prior()) == pytest.approx(2.5)
     still = estimate(7.0)
     still.T_anchor_frame[1:7, :3, 3] *= 1e-5  # the keyframes stand, the newest frame moves
-    assert aligner.align(still, previous()) == pytest.approx(2.5)
-    assert aligner.align(estimate(4.0), previous()) == pytest.approx(4.0)
+    assert aligner.align(still, prior()) == pytest.approx(2.5)
+    assert aligner.align(estimate(4.0), prior()) == pytest.approx(4.0)
 
 
 def test_a_window_that_does_not_move_at_all_keeps_the_last_scale():
     aligner = ScaleAligner('translation')
-    aligner.align(estimate(2.5), previous())
-    assert aligner.align(estimate(1.0, translations=0.0), previous()) == pytest.approx(2.5)
+    aligner.align(estimate(2.5), prior())
+    assert aligner.align(estimate(1.0, translations=0.0), prior()) == pytest.approx(2.5)
 
 
 def slide(positions: np.ndarray, noise: float, rng: np.random.Generator) -> list[float]:
@@ -117,7 +119,7 @@ def test_a_long_rest_carries_no_scale_away(noise):
 
 def test_one_image_again_and_again_keeps_the_last_scale():
     aligner = ScaleAligner('translation')
-    assert aligner.align(estimate(2.5), previous()) == pytest.approx(2.5)
+    assert aligner.align(estimate(2.5), prior()) == pytest.approx(2.5)
     known = WindowPrior(np.tile(np.eye(4), (7, 1, 1)), np.eye(4), None)  # all at the anchor
     assert aligner.align(estimate(7.0, with_points=False), known) == pytest.approx(2.5)
 
@@ -133,7 +135,7 @@ def test_first_window_starts_at_median_depth_one():
 
 def test_a_new_start_takes_up_the_depth_last_seen():
     aligner = ScaleAligner('depth')
-    aligner.align(estimate(2.0), previous())
+    aligner.align(estimate(2.0), prior())
     depth = 2.0 * np.median(estimate(2.0).points.depths)
     again = estimate(9.0)
     assert aligner.align(again, None) * np.median(again.points.depths) == pytest.approx(depth)
@@ -182,3 +184,23 @@ def test_too_few_or_worthless_points_tell_nothing():
     assert compare_depths(points(), Points(worthless.ids, worthless.positions,
                                            np.zeros(40))) is None
     assert compare_depths(None, few) is None
+
+
+@pytest.mark.parametrize(('factor', 'moves'), [(0.99, False), (1.01, True)])
+def test_standstill_is_a_share_of_the_extent(factor, moves):
+    new = np.tile(np.eye(4), (3, 1, 1))
+    new[2, 0, 3] = 4.0  # the newest frame: the extent of the window
+    new[1, 0, 3] = factor * STANDSTILL * 4.0
+    known = new[:2].copy()
+    known[1, 0, 3] = 2.0 * new[1, 0, 3]
+    assert compare_translations(known, new) == (pytest.approx(2.0) if moves else None)
+
+
+@pytest.mark.parametrize(('offset', 'agree'), [(0.01, True), (-0.01, False)])
+def test_known_and_new_positions_must_agree(offset, agree):
+    angle = np.arccos(LEAST_AGREEMENT + offset)
+    known, new = (np.tile(np.eye(4), (count, 1, 1)) for count in (2, 3))
+    known[1, :3, 3] = [3.0, 0.0, 0.0]
+    new[1, :3, 3] = [np.cos(angle), np.sin(angle), 0.0]
+    new[2, :3, 3] = 2.0 * new[1, :3, 3]
+    assert compare_translations(known, new) == (pytest.approx(3.0) if agree else None)

@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""``python -m kfvo_ros.node`` in a process of its own: what comes out, and how it is told."""
+"""``python -m kfvo_ros.node`` in a process of its own: topics, signals, parameters."""
 
 from __future__ import annotations
 
@@ -34,30 +34,30 @@ from kfvo_ros.odometry.options import OdometryOptions
 from kfvo_ros.trajectory import NANOSECONDS, read_tum
 
 PATH_LENGTH = 15
-MOUNTING = (0.4, -0.2, 1.1, 0.5, -0.1, 0.7, 0.5)
+BASE_TO_CAMERA = (0.4, -0.2, 1.1, 0.5, -0.1, 0.7, 0.5)
 STAMPS_NS = [frame.stamp_ns for frame in make_frames()]
 
 
 @pytest.fixture(scope='module')
-def drive(tmp_path_factory) -> SimpleNamespace:
-    """Return what a node said of the whole walk and left behind."""
-    file = tmp_path_factory.mktemp('drive') / 'deep' / 'walk.tum'
+def online(tmp_path_factory) -> SimpleNamespace:
+    """Return messages, log and files of a node that processed the whole walk."""
+    file = tmp_path_factory.mktemp('online') / 'deep' / 'walk.tum'
     with Rig(trajectory_file=file, path_max_length=PATH_LENGTH, path_rate=20.0) as rig:
-        messages = rig.drive(make_frames())
+        messages = rig.run(make_frames())
         rig.wait_for_value('images processed', COUNT)
         wait_until(lambda: stamp_ns(rig.listener.messages(PATH)[-1]) == STAMPS_NS[-1])
         state, paths = rig.state(), rig.listener.messages(PATH)
         keyframes = rig.listener.messages(KEYFRAME)
-        outputs = dict(rig.listener.node.get_publisher_names_and_types_by_node('kfvo', '/'))
+        topics = dict(rig.listener.node.get_publisher_names_and_types_by_node('kfvo', '/'))
         took = rig.stop()
     return SimpleNamespace(messages=messages, state=state, paths=paths, took=took, file=file,
-                           code=rig.process.returncode, lines=rig.lines, outputs=outputs,
+                           code=rig.process.returncode, lines=rig.lines, topics=topics,
                            keyframes=keyframes)
 
 
 @pytest.fixture(scope='module')
 def offline(tmp_path_factory) -> SimpleNamespace:
-    """Return the same walk without ROS: arrivals, the last path, and the final poses."""
+    """Return the same walk without ROS: poses at arrival, the last path, the final poses."""
     file = tmp_path_factory.mktemp('offline') / 'walk.tum'
     live = OnlineOdometry(make_odometry(OdometryOptions()), TrajectoryLog(file), 1.0, PATH_LENGTH)
     arrivals = [live.process(frame).T_world_camera for frame in make_frames()]
@@ -66,21 +66,21 @@ def offline(tmp_path_factory) -> SimpleNamespace:
     return SimpleNamespace(arrivals=arrivals, path=path, final=read_tum(file))
 
 
-def test_one_odometry_per_image_with_its_very_stamp(drive, offline):
-    assert [stamp_ns(message) for message in drive.messages] == STAMPS_NS
+def test_one_odometry_per_image_with_its_stamp(online, offline):
+    assert [stamp_ns(message) for message in online.messages] == STAMPS_NS
     assert {(message.header.frame_id, message.child_frame_id)
-            for message in drive.messages} == {('odom', 'lens_body')}
-    for message, arrival in zip(drive.messages, offline.arrivals, strict=True):
+            for message in online.messages} == {('odom', 'lens_body')}
+    for message, arrival in zip(online.messages, offline.arrivals, strict=True):
         q = message.pose.pose.orientation
         assert abs(np.linalg.norm([q.x, q.y, q.z, q.w]) - 1.0) < 1e-12
         np.testing.assert_allclose(to_pose(message.pose.pose),
                                    base_pose(arrival, T_BODY_OPTICAL), atol=1e-9)
-    np.testing.assert_allclose(to_pose(drive.messages[0].pose.pose), np.eye(4), atol=1e-12)
+    np.testing.assert_allclose(to_pose(online.messages[0].pose.pose), np.eye(4), atol=1e-12)
 
 
 @pytest.mark.parametrize('part', ['pose', 'twist'])
-def test_covariances_are_proper_and_follow_the_data(drive, part):
-    found = np.array([getattr(message, part).covariance for message in drive.messages])
+def test_covariances_are_positive_definite_and_depend_on_the_data(online, part):
+    found = np.array([getattr(message, part).covariance for message in online.messages])
     for matrix in found.reshape(-1, 6, 6):
         assert (matrix == matrix.T).all()
         assert np.linalg.eigvalsh(matrix)[0] > 0.0
@@ -88,10 +88,10 @@ def test_covariances_are_proper_and_follow_the_data(drive, part):
     assert found[-1, 0] < 1.0
 
 
-def test_twist_is_the_motion_since_the_image_before(drive):
-    """In the axes of the base; refinement of the frame before is all that may differ."""
+def test_twist_is_the_motion_since_the_previous_image(online):
+    """In the axes of the base; only the refinement of the previous frame may differ."""
     differences, twists = [], []
-    for before, message in zip(drive.messages[:-1], drive.messages[1:], strict=True):
+    for before, message in zip(online.messages[:-1], online.messages[1:], strict=True):
         moved = geometry.relative(to_pose(before.pose.pose), to_pose(message.pose.pose))
         seconds = (stamp_ns(message) - stamp_ns(before)) / NANOSECONDS
         differences.append(np.append(moved[:3, :3].T @ moved[:3, 3],
@@ -102,21 +102,21 @@ def test_twist_is_the_motion_since_the_image_before(drive):
     assert np.median(misfit) < 0.2 * np.median(np.linalg.norm(twists, axis=1))
 
 
-def test_path_is_refined_and_bounded(drive, offline):
-    assert max(len(path.poses) for path in drive.paths) == PATH_LENGTH
-    last = drive.paths[-1]
+def test_path_is_refined_and_bounded(online, offline):
+    assert max(len(path.poses) for path in online.paths) == PATH_LENGTH
+    last = online.paths[-1]
     assert last.header.frame_id == 'odom'
     assert [stamp_ns(pose) for pose in last.poses] == STAMPS_NS[-PATH_LENGTH:]
     for pose, (stamp, T_world_camera) in zip(last.poses, offline.path, strict=True):
         assert stamp_ns(pose) == stamp
         np.testing.assert_allclose(to_pose(pose.pose), base_pose(T_world_camera, T_BODY_OPTICAL),
                                    atol=1e-9)
-    arrival = [to_pose(message.pose.pose) for message in drive.messages[-PATH_LENGTH:]]
+    arrival = [to_pose(message.pose.pose) for message in online.messages[-PATH_LENGTH:]]
     assert not np.allclose([to_pose(pose.pose) for pose in last.poses], arrival, atol=1e-6)
 
 
-def test_diagnostics_count(drive):
-    level, summary, values = drive.state
+def test_diagnostics_count(online):
+    level, summary, values = online.state
     assert (level, summary) == (0, 'tracking')
     counted = ('images lost in transit', 'images received', 'images processed', 'images dropped',
                'images refused', 'resets')
@@ -126,16 +126,16 @@ def test_diagnostics_count(drive):
     assert (values['backbone'], values['keyframe policy']) == ('geometric', 'learned')
 
 
-def test_keyframes_are_poses_again(drive):
-    stamps = [stamp_ns(message) for message in drive.keyframes]
-    assert str(len(stamps)) == drive.state[2]['keyframes'] and 0 < len(stamps) < COUNT
-    poses = {stamp_ns(message): message.pose.pose for message in drive.messages}
-    assert [message.pose for message in drive.keyframes] == [poses[stamp] for stamp in stamps]
-    assert {message.header.frame_id for message in drive.keyframes} == {'odom'}
+def test_keyframes_repeat_the_pose_of_their_odometry(online):
+    stamps = [stamp_ns(message) for message in online.keyframes]
+    assert str(len(stamps)) == online.state[2]['keyframes'] and 0 < len(stamps) < COUNT
+    poses = {stamp_ns(message): message.pose.pose for message in online.messages}
+    assert [message.pose for message in online.keyframes] == [poses[stamp] for stamp in stamps]
+    assert {message.header.frame_id for message in online.keyframes} == {'odom'}
 
 
-def test_trajectory_file_is_that_of_the_odometry_offline(drive, offline):
-    written = read_tum(drive.file)
+def test_trajectory_file_equals_that_of_offline_odometry(online, offline):
+    written = read_tum(online.file)
     assert list(written.stamps_ns) == STAMPS_NS
     np.testing.assert_allclose(written.poses, offline.final.poses, atol=1e-9)
     assert not np.allclose(written.poses, offline.arrivals, atol=1e-6)  # it is refined
@@ -144,23 +144,23 @@ def test_trajectory_file_is_that_of_the_odometry_offline(drive, offline):
 @pytest.mark.parametrize(('file', 'shown'), [
     ('rviz/kfvo.rviz', {ODOMETRY, PATH}),
     ('foxglove/kfvo.json', {ODOMETRY, PATH, KEYFRAME, DIAGNOSTICS})])
-def test_viewers_show_what_it_publishes(drive, file, shown):
+def test_viewer_layouts_show_published_topics(online, file, shown):
     text = (Path(__file__).parents[2] / file).read_text()
-    assert set(re.findall(r'/(?:kfvo/\w+|diagnostics)', text)) == shown <= set(drive.outputs)
+    assert set(re.findall(r'/(?:kfvo/\w+|diagnostics)', text)) == shown <= set(online.topics)
 
 
-def test_it_logs_nothing_but_information(drive):
-    assert (drive.code, drive.took < 2.0) == (0, True)
-    problems = [line for line in drive.lines if '[INFO]' not in line and 'tf2_ros' not in line]
+def test_log_holds_information_only(online):
+    assert (online.code, online.took < 2.0) == (0, True)
+    problems = [line for line in online.lines if '[INFO]' not in line and 'tf2_ros' not in line]
     assert problems == []
 
 
-def test_the_pose_of_a_base_that_carries_the_camera(offline):
-    """In odometry and path: odom is where the base, not the camera, was at first."""
-    T_base_camera = geometry.transform_from_xyz_quat(np.array(MOUNTING))
-    with Rig(base_frame='base_link', base_to_camera=' '.join(map(str, MOUNTING)),
+def test_poses_of_a_base_with_base_to_camera(offline):
+    """In odometry and path: odom is the base, not the camera, at the first image."""
+    T_base_camera = geometry.transform_from_xyz_quat(np.array(BASE_TO_CAMERA))
+    with Rig(base_frame='base_link', base_to_camera=' '.join(map(str, BASE_TO_CAMERA)),
              path_rate=20.0) as rig:
-        messages = rig.drive(make_frames()[:12])
+        messages = rig.run(make_frames()[:12])
         wait_until(lambda: stamp_ns(rig.listener.messages(PATH)[-1]) == STAMPS_NS[11])
         path = rig.listener.messages(PATH)[-1]
     assert {(message.header.frame_id, message.child_frame_id)
@@ -173,7 +173,7 @@ def test_the_pose_of_a_base_that_carries_the_camera(offline):
 
 
 @pytest.mark.parametrize('sent', [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_it_in_good_order_amid_its_work(sent, tmp_path):
+def test_a_signal_during_work_ends_it_with_status_0(sent, tmp_path):
     file = tmp_path / 'walk.tum'
     with Rig(trajectory_file=file) as rig:
         rig.send(make_frames())
@@ -184,7 +184,7 @@ def test_a_signal_ends_it_in_good_order_amid_its_work(sent, tmp_path):
         count = len(rig.odometry())
     written = list(read_tum(file).stamps_ns)
     assert written == STAMPS_NS[:len(written)]
-    assert len(written) >= count  # the last message may be lost on its way
+    assert len(written) >= count  # the last message may be lost in transit
 
 
 @pytest.mark.parametrize(('parameter', 'parts'), [
@@ -197,11 +197,11 @@ def test_a_signal_ends_it_in_good_order_amid_its_work(sent, tmp_path):
     ('base_to_camera:="0 0 0 0 0 0 1"', ['base_to_camera', 'base_frame']),
     ('base_frame:=base_link', ['base_link', 'tf2_ros', 'base_to_camera']),
 ])
-def test_a_parameter_that_cannot_be_is_told_in_one_line(parameter, parts):
+def test_an_invalid_parameter_ends_in_one_line(parameter, parts):
     if 'tf2_ros' in parts:
         try:
             import tf2_ros  # noqa: F401
-            pytest.skip('there is TF')
+            pytest.skip('tf2_ros is installed')
         except ImportError:
             pass
     done = run_module(NODE, '--ros-args', '-p', parameter)
@@ -210,42 +210,42 @@ def test_a_parameter_that_cannot_be_is_told_in_one_line(parameter, parts):
     assert all(part in line for part in parts), line
 
 
-def test_typos_are_named_and_whole_numbers_are_numbers():
-    """A scale of 3, not 3.0; it multiplies what a scale of 1 gives."""
+def test_unknown_parameters_are_logged_and_integers_are_valid_numbers():
+    """A scale of 3, not 3.0; it multiplies the poses at scale 1."""
     with Rig(scale=3, keyframe='every', nonsense=1) as rig:
         assert 'is keyframes meant?' in rig.wait_for_line('unknown parameter keyframe:')
         assert 'expected one of' in rig.wait_for_line('unknown parameter nonsense:')
-        scaled = to_pose(rig.drive(make_frames()[:8])[-1].pose.pose)
+        scaled = to_pose(rig.run(make_frames()[:8])[-1].pose.pose)
     odometry = make_odometry(OdometryOptions())
     plain = [odometry.process(frame).T_world_camera for frame in make_frames()[:8]][-1]
     np.testing.assert_allclose(scaled[:3, 3], 3.0 * (T_BODY_OPTICAL @ plain)[:3, 3], atol=1e-9)
 
 
 def test_only_the_newest_image_waits_by_default():
-    """A camera that is faster than the node: images are dropped, the last one never."""
+    """A camera faster than the node: images are dropped, but never the last one."""
     with Rig(process_every_frame=False) as rig:
         for frame in make_frames():
             rig.send([frame])
             time.sleep(0.002)
         wait_until(lambda: stamp_ns(rig.odometry(1)[-1]) == STAMPS_NS[-1])
-        came = {stamp_ns(message) for message in rig.odometry()}
-        rig.wait_for_value('images processed', len(came))
+        processed = {stamp_ns(message) for message in rig.odometry()}
+        rig.wait_for_value('images processed', len(processed))
         values = {key: int(rig.state()[2][f'images {key}']) for key in ('received', 'dropped')}
-    assert values['dropped'] > 0 and len(came) < COUNT
-    assert values['dropped'] + len(came) == values['received']
+    assert values['dropped'] > 0 and len(processed) < COUNT
+    assert values['dropped'] + len(processed) == values['received']
 
 
-def test_a_folder_that_goes_away_costs_the_file_alone(tmp_path):
+def test_a_removed_folder_loses_the_trajectory_file_only(tmp_path):
     folder = tmp_path / 'out'
     with Rig(trajectory_file=folder / 'walk.tum') as rig:
-        rig.drive(make_frames()[:5])
+        rig.run(make_frames()[:5])
         folder.rename(tmp_path / 'away')
         folder.touch()
         rig.reset()
-        assert len(rig.drive(make_frames()[5:10])) == 5
+        assert len(rig.run(make_frames()[5:10])) == 5
         assert str(folder) in rig.wait_for_line('cannot write the trajectory')
         rig.reset()
-        assert len(rig.drive(make_frames()[10:15])) == 5
+        assert len(rig.run(make_frames()[10:15])) == 5
         rig.stop()
         assert rig.process.returncode == 0
     assert len(read_tum(tmp_path / 'away' / 'walk.tum')) == 5

@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What cameras publish, well or badly, and what kfvo_node makes of it."""
+"""Inputs of kfvo_node: QoS, encodings, invalid images, calibrations."""
 
 from __future__ import annotations
 
@@ -41,26 +41,26 @@ CAMERA = FRAMES[0].camera
 
 
 @pytest.mark.parametrize('qos', [RELIABLE, BEST_EFFORT], ids=['reliable', 'best_effort'])
-@pytest.mark.parametrize('late', [False, True], ids=['before', 'after'])
-def test_a_camera_of_either_reliability_that_starts_before_or_after(qos, late):
-    with Rig(qos=qos, late=late) as rig:
-        if late:
-            time.sleep(0.3)  # it has looked for a publisher in vain
+@pytest.mark.parametrize('late_camera', [False, True], ids=['before', 'after'])
+def test_a_camera_of_either_reliability_that_starts_before_or_after(qos, late_camera):
+    with Rig(qos=qos, late_camera=late_camera) as rig:
+        if late_camera:
+            time.sleep(0.3)  # the node has searched without finding a publisher
             rig.start_camera()
             rig.wait_for_subscriber()
         reliability = qos.reliability.name.lower()
         rig.wait_for_line(f'subscribed to {IMAGE} ({reliability}, as its publisher)')
-        rig.send_until_heard(FRAMES[:5])
+        rig.send_until_odometry(FRAMES[:5])
         assert is_origin(rig.odometry(1)[0])
 
 
 def test_a_best_effort_camera_joins_a_reliable_one():
-    """What was asked for is lowered while it runs."""
+    """The requested reliability is lowered while the node runs."""
     with Rig() as rig:
-        rig.drive(FRAMES[:2])
+        rig.run(FRAMES[:2])
         rig._qos = BEST_EFFORT
         rig.start_camera()
-        rig.wait_for_line('subscribing anew')
+        rig.wait_for_line('subscribing again')
         rig.wait_for_line(f'subscribed to {IMAGE} (best_effort, as its publisher')
         rig.wait_for_subscriber()
         before = len(rig.odometry())
@@ -70,10 +70,10 @@ def test_a_best_effort_camera_joins_a_reliable_one():
         wait_until(lambda: len(rig.odometry()) > before + 3)
 
 
-def test_reliable_asked_of_a_best_effort_camera_tells_the_remedy():
-    with Rig(qos=BEST_EFFORT, late=True, image_qos='reliable') as rig:
+def test_reliable_subscription_to_a_best_effort_camera_logs_the_remedy():
+    with Rig(qos=BEST_EFFORT, late_camera=True, image_qos='reliable') as rig:
         rig.start_camera()
-        line = rig.wait_for_line('does not offer the reliability')
+        line = rig.wait_for_line('does not offer the requested reliability')
         assert '[ERROR]' in line and IMAGE in line and 'set image_qos to auto' in line
 
 
@@ -81,14 +81,14 @@ def test_compressed_images():
     with Rig(sensor_msgs.CompressedImage, f'{IMAGE}/compressed') as rig:
         for frame in FRAMES[:6]:
             rig.info.publish(to_info(CAMERA, frame.stamp_ns))
-            for_sending = sensor_msgs.CompressedImage(
+            message = sensor_msgs.CompressedImage(
                 format='mono8; png compressed mono8',
                 data=cv2.imencode('.png', frame.image)[1].tobytes())
-            rig.image.publish(stamped(for_sending, frame.stamp_ns))
+            rig.image.publish(stamped(message, frame.stamp_ns))
         compressed = [to_pose(message.pose.pose) for message in rig.odometry(6)]
     with Rig() as rig:
-        raw = [to_pose(message.pose.pose) for message in rig.drive(FRAMES[:6])]
-    np.testing.assert_allclose(compressed, raw, atol=1e-9)  # PNG loses nothing
+        raw = [to_pose(message.pose.pose) for message in rig.run(FRAMES[:6])]
+    np.testing.assert_allclose(compressed, raw, atol=1e-9)  # PNG is lossless
 
 
 def encoded(image: np.ndarray) -> list[tuple[str, np.ndarray, int]]:
@@ -105,7 +105,7 @@ def encoded(image: np.ndarray) -> list[tuple[str, np.ndarray, int]]:
     return [(name, pixels.reshape(len(image), -1), big) for name, pixels, big in rows]
 
 
-def test_every_encoding_shows_the_same():
+def test_all_encodings_give_the_same_poses():
     """One camera that changes its encoding with every image."""
     count = len(encoded(FRAMES[0].image))
     with Rig() as rig:
@@ -121,53 +121,53 @@ def test_every_encoding_shows_the_same():
     assert [stamp_ns(message) for message in mixed] == [
         frame.stamp_ns for frame in FRAMES[:count]]
     with Rig() as rig:
-        grey = [to_pose(message.pose.pose)[:3, 3] for message in rig.drive(FRAMES[:count])]
+        grey = [to_pose(message.pose.pose)[:3, 3] for message in rig.run(FRAMES[:count])]
     positions = np.array([to_pose(message.pose.pose)[:3, 3] for message in mixed])
-    # A mosaic of grey is smoothed, nothing else changes.
+    # Demosaicing smooths grey; the other encodings change nothing.
     assert np.abs(positions - grey).max() < 0.05 * np.linalg.norm(grey[-1])
 
 
-def garbage(stamp: int, image: np.ndarray) -> list:
-    """Return images that no driver should send."""
+def invalid_images(stamp: int, image: np.ndarray) -> list:
+    """Return messages that are not images."""
     return [to_image(stamp, image, **fields) for fields in (
         {'data': []}, {'encoding': 'nonsense'}, {'encoding': ''}, {'step': 7},
         {'step': 2 ** 31}, {'width': 0, 'height': 0, 'step': 0, 'data': []}, {'height': 0},
         {'width': 2 ** 32 - 1}, {'encoding': 'rgb8'}, {'height': HEIGHT + 1})]
 
 
-def test_garbage_is_refused_and_counted_and_good_images_go_on():
-    bad = garbage(FRAMES[3].stamp_ns, FRAMES[3].image)
+def test_invalid_images_are_refused_and_counted():
+    bad = invalid_images(FRAMES[3].stamp_ns, FRAMES[3].image)
     with Rig() as rig:
-        rig.drive(FRAMES[:3])
+        rig.run(FRAMES[:3])
         for message in bad:
             rig.image.publish(message)
         rig.wait_for_value('images refused', len(bad))
         level, summary, _ = rig.state()
         assert level == WARN and 'expected a' in summary
         assert '[ERROR]' in rig.wait_for_line('[kfvo]: expected a 320x240 mono8 image')
-        after = rig.drive(FRAMES[3:6])
-        assert not is_origin(after[0])  # nothing begins anew
+        after = rig.run(FRAMES[3:6])
+        assert not is_origin(after[0])  # no reset
         rig.wait_for_value('images processed', 6)
         assert rig.state()[0] == 0
-        # A second image of the same stamp is none.
+        # A second image of the same stamp is refused too.
         rig.send([FRAMES[5]])
         rig.wait_for_value('images refused', len(bad) + 1)
         assert 'have the stamp' in rig.state()[1]
 
 
-def test_another_resolution_begins_anew():
+def test_another_resolution_resets():
     large = [Frame(frame.stamp_ns, cv2.resize(frame.image, (2 * WIDTH, 2 * HEIGHT)),
                    CAMERA.scaled(2 * WIDTH, 2 * HEIGHT)) for frame in FRAMES[6:10]]
     with Rig() as rig:
-        rig.drive(FRAMES[:6])
-        messages = rig.drive(large)
+        rig.run(FRAMES[:6])
+        messages = rig.run(large)
         assert [is_origin(message) for message in messages] == [True, False, False, False]
-        rig.wait_for_line('starting anew at the origin: the calibration changed')
+        rig.wait_for_line('restarting at the origin: the calibration changed')
         rig.wait_for_line('images of 640x480, fx 400.0')
         rig.wait_for_value('resets', 1)
 
 
-def test_without_calibration_it_tells_both_remedies_and_waits():
+def test_without_calibration_it_waits_and_logs_both_remedies():
     with Rig() as rig:
         rig.send(FRAMES[:3], with_info=False)
         line = rig.wait_for_line('no calibration')
@@ -188,7 +188,7 @@ def test_without_calibration_it_tells_both_remedies_and_waits():
             frame.stamp_ns for frame in FRAMES[4:6]]
 
 
-def test_a_calibration_file_wins_over_the_topic(tmp_path):
+def test_a_calibration_file_takes_precedence_over_the_topic(tmp_path):
     write_camera_info(tmp_path / 'camera.yaml', CAMERA)
     with Rig(camera_info_file=tmp_path / 'camera.yaml') as rig:
         rig.send(FRAMES[:4], with_info=False)
@@ -197,8 +197,8 @@ def test_a_calibration_file_wins_over_the_topic(tmp_path):
         assert rig.info.get_subscription_count() == 0
 
 
-def test_rectified_images_are_those_of_p_without_distortion():
-    """K and D are those of the raw image, and R says how it was turned."""
+def test_rectified_images_use_p_without_distortion():
+    """K and D belong to the raw image; R rotates it to the rectified one."""
     info = to_info(CAMERA)
     info.k = np.diag([1.5, 1.4, 1.0]).dot(CAMERA.matrix).ravel()
     info.d = [-0.3, 0.1, 0.01, -0.01, 0.0]
@@ -214,4 +214,4 @@ def test_rectified_images_are_those_of_p_without_distortion():
     ideal = [base_pose(odometry.process(frame).T_world_camera, T_BODY_OPTICAL)
              for frame in FRAMES[:8]]
     np.testing.assert_allclose(found['/camera/image_rect'], ideal, atol=1e-9)
-    assert np.abs(np.array(found[IMAGE]) - ideal).max() > 1e-3  # so much K and D would change
+    assert np.abs(np.array(found[IMAGE]) - ideal).max() > 1e-3  # the effect of K and D

@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""One running kfvo_node, asked to start anew, to pause and to save, and driven along its axes."""
+"""Services of a running kfvo_node, resets, and the axes of its poses."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ STAMPS_NS = [frame.stamp_ns for frame in make_frames()]
 
 @pytest.fixture(scope='module')
 def rig(tmp_path_factory):
-    """Give a node for tests that begin with a reset; the file's name is that of its folder."""
+    """Yield a node for tests that start with a reset; ``rig.file`` is its trajectory file."""
     file = tmp_path_factory.mktemp('saved') / 'walk.tum'
     with Rig(trajectory_file=file) as rig:
         rig.file = file
@@ -29,17 +29,17 @@ def rig(tmp_path_factory):
 
 def test_reset_makes_the_next_image_the_origin(rig):
     rig.reset()
-    first = rig.drive(make_frames()[:10])
+    first = rig.run(make_frames()[:10])
     assert [is_origin(message) for message in first] == [True] + [False] * 9
     assert rig.call(std_srvs.Trigger, 'reset').success
-    second = rig.drive(make_frames()[10:20])
+    second = rig.run(make_frames()[10:20])
     assert [is_origin(message) for message in second] == [True] + [False] * 9
-    assert 'starting anew at the origin: asked to' in rig.lines[-2] + rig.lines[-1]
+    assert 'restarting at the origin: requested' in rig.lines[-2] + rig.lines[-1]
 
 
-def test_paused_it_takes_in_nothing(rig):
+def test_paused_it_processes_nothing(rig):
     rig.reset()
-    before = rig.drive(make_frames()[:5])
+    before = rig.run(make_frames()[:5])
     received = int(rig.state()[2]['images received'])
     answer = rig.call(std_srvs.SetBool, 'pause', data=True)
     assert (answer.success, answer.message) == (True, 'paused')
@@ -50,9 +50,9 @@ def test_paused_it_takes_in_nothing(rig):
     assert len(rig.odometry()) == len(before)
     answer = rig.call(std_srvs.SetBool, 'pause', data=False)
     assert (answer.success, answer.message) == (True, 'running')
-    after = rig.drive(make_frames()[10:13])
+    after = rig.run(make_frames()[10:13])
     assert [stamp_ns(message) for message in after] == STAMPS_NS[10:13]
-    assert not is_origin(after[0])  # it goes on where it was
+    assert not is_origin(after[0])  # it continues where it was
 
 
 def test_save_trajectory_writes_all_poses_to_a_new_file_each_time(rig):
@@ -61,23 +61,23 @@ def test_save_trajectory_writes_all_poses_to_a_new_file_each_time(rig):
     assert (refused.success, refused.message) == (False, 'there is no pose yet')
     files = []
     for begin, end in ((0, 12), (12, 20)):
-        rig.drive(make_frames()[begin:end])
+        rig.run(make_frames()[begin:end])
         answer = rig.call(std_srvs.Trigger, 'save_trajectory')
         count, _, file = answer.message.partition(' poses written to ')
         assert answer.success and int(count) == end
         files.append(Path(file))
     assert [list(read_tum(file).stamps_ns) for file in files] == [
         STAMPS_NS[:count] for count in (12, 20)]
-    assert rig.file not in files  # that one grows
+    assert rig.file not in files  # that is the growing one
 
 
-def test_stamps_that_go_back_begin_anew(rig):
+def test_stamps_that_go_back_reset(rig):
     rig.reset()
     resets = int(rig.state()[2]['resets'])
-    messages = rig.drive(make_frames()[:10]) + rig.drive(make_frames()[:5])
+    messages = rig.run(make_frames()[:10]) + rig.run(make_frames()[:5])
     assert [index for index, message in enumerate(messages) if is_origin(message)] == [0, 10]
     assert 'went back by 0.300 s' in rig.wait_for_line('the stamps went back')
-    for index in (1, 3):  # the same images, so the same poses
+    for index in (1, 3):  # same images, same poses
         np.testing.assert_allclose(to_pose(messages[10 + index].pose.pose),
                                    to_pose(messages[index].pose.pose), atol=1e-9)
     wait_until(lambda: int(rig.state()[2]['resets']) > resets)
@@ -86,14 +86,14 @@ def test_stamps_that_go_back_begin_anew(rig):
 @pytest.mark.parametrize(('step', 'axis', 'sign'), [((0, 0, 0.03), 0, 1), ((0.03, 0, 0), 1, -1)],
                          ids=['forward', 'right'])
 def test_axes(rig, step, axis, sign):
-    """The camera's z is odom's x, its x is odom's -y."""
+    """The camera's z is x of odom, its x is -y of odom."""
     sequence = SyntheticSequence(0, 'smooth', 12, WIDTH, HEIGHT)
     start = sequence.ground_truth().trajectory.poses[0]
     moves = [geometry.make_transform(np.eye(3), index * np.array(step, dtype=float))
              for index in range(sequence.length)]
     sequence._poses = start @ np.array(moves)
     rig.reset()
-    position = to_pose(rig.drive(list(sequence))[-1].pose.pose)[:3, 3]
+    position = to_pose(rig.run(list(sequence))[-1].pose.pose)[:3, 3]
     direction = position / np.linalg.norm(position)
     assert direction[axis] * sign > 0.98
     assert np.linalg.norm(position) > 0.02

@@ -1,19 +1,20 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""``python -m kfvo_ros.play`` in a process of its own, heard by a node in this one."""
+"""``python -m kfvo_ros.play`` in a process of its own, received by a node in this one."""
 
 from __future__ import annotations
 
 import signal
 import subprocess
+import sys
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_writers import LATER_NS, START_NS, STORAGES, BagWriter, Records
+from bag_writers import LATER_NS, START_NS, STORAGES, BagBuilder, Records
 from command_lines import assert_one_readable_line, one_readable_line
-from ros_processes import Listener, run_module, running_module, wait_until
+from ros_processes import ENVIRONMENT, Listener, run_module, running_module, wait_until
 from rosbags.interfaces import (
     Qos,
     QosDurability,
@@ -51,7 +52,7 @@ def stamps(listener: Listener, topic: str) -> list[int]:
     return [stamp_ns(message) for message in listener.messages(topic)]
 
 
-def imu(writer: BagWriter, index: int):
+def imu(writer: BagBuilder, index: int):
     rates, zeros = np.array([0.1, -0.2, index / 3]), np.zeros(9)
     return writer.make('sensor_msgs/Imu', header=writer.header(START_NS + IMU_NS * index, 'imu'),
                        orientation=writer.quaternion((0, 0, 0, 1)), orientation_covariance=zeros,
@@ -61,8 +62,8 @@ def imu(writer: BagWriter, index: int):
                        linear_acceleration_covariance=np.arange(9.0))
 
 
-def euroc_records(writer: BagWriter) -> Records:
-    """Return what a EuRoC bag holds: no CameraInfo, and truth on either of its two topics."""
+def euroc_records(writer: BagBuilder) -> Records:
+    """Return the messages of a EuRoC bag: no CameraInfo, ground truth on two topics."""
     records = [(IMU, START_NS + IMU_NS * index + LATER_NS, imu(writer, index))
                for index in range((FRAMES - 1) * FRAME_NS // IMU_NS)]
     for index, stamp in enumerate(STAMPS_NS):
@@ -78,22 +79,22 @@ def euroc_records(writer: BagWriter) -> Records:
 def bags(tmp_path_factory) -> dict[str, Path]:
     """Return a EuRoC bag in each storage."""
     folder = tmp_path_factory.mktemp('bags')
-    return {storage: (writer := BagWriter(storage)).write(folder / storage, euroc_records(writer))
+    return {storage: (writer := BagBuilder(storage)).write(folder / storage, euroc_records(writer))
             for storage in STORAGES}
 
 
 def played(done: subprocess.CompletedProcess) -> list[str]:
-    """Assert that it ended well; return the lines it told, without those of a busy machine."""
+    """Assert success; return the logged lines without those about lateness."""
     assert done.returncode == 0, done.stderr
     return [line for line in done.stderr.splitlines()
             if line.startswith('kfvo_play') and ' s late: ' not in line]
 
 
 @pytest.mark.parametrize('storage', STORAGES)
-def test_everything_but_the_second_camera_arrives_as_it_was(storage, bags):
+def test_all_topics_but_the_second_camera_arrive_unchanged(storage, bags):
     with Listener(EUROC) as listener:
         lines = played(run_module(PLAY, bags[storage], '--wait-for-subscribers'))
-        wait_until(lambda: len(listener.heard) >= 3 * FRAMES + (FRAMES - 1) * 10)
+        wait_until(lambda: len(listener.received) >= 3 * FRAMES + (FRAMES - 1) * 10)
     choice, = lines
     assert CAM0 in choice and choice.endswith(f'--topic plays others: {CAM1}')
     assert not listener.messages(CAM1)
@@ -103,11 +104,11 @@ def test_everything_but_the_second_camera_arrives_as_it_was(storage, bags):
         assert (image.encoding, image.height, image.width, image.step) == ('mono8', 24, 32, 32)
         assert image.header.frame_id == CAM0
         assert bytes(image.data) == make_image(index).tobytes()
-    inertial = listener.messages(IMU)
-    assert [stamp_ns(message) for message in inertial] == list(
+    imu_messages = listener.messages(IMU)
+    assert [stamp_ns(message) for message in imu_messages] == list(
         range(START_NS, START_NS + (FRAMES - 1) * FRAME_NS, IMU_NS))
-    assert inertial[7].angular_velocity.z == 7 / 3
-    assert list(inertial[7].linear_acceleration_covariance) == list(range(9))
+    assert imu_messages[7].angular_velocity.z == 7 / 3
+    assert list(imu_messages[7].linear_acceleration_covariance) == list(range(9))
     point, moved = listener.messages(LEICA)[5].point, listener.messages(VICON)[5]
     assert [point.x, point.y, point.z] == list(POSES[5, :3, 3])
     rotation = moved.transform.rotation
@@ -115,14 +116,14 @@ def test_everything_but_the_second_camera_arrives_as_it_was(storage, bags):
     assert (moved.header.frame_id, moved.child_frame_id) == ('world', 'body')
 
 
-def test_chosen_topics_remapped_and_never_faster_than_asked(bags):
+def test_selected_topics_are_remapped_and_not_faster_than_the_rate(bags):
     with Listener({'/image': sensor_msgs.Image, **EUROC}) as listener:
         lines = played(run_module(
             PLAY, bags['ros1'], '--topic', 'cam1/image_raw', '--topic', IMU, '--rate', 0.5,
             '--wait-for-subscribers', 1, '--ros-args', '-r', f'{CAM1}:=/image'))
         wait_until(lambda: len(listener.messages('/image')) >= FRAMES)
     assert lines == []
-    assert {topic for _, topic, _ in listener.heard} == {'/image', IMU}
+    assert {topic for _, topic, _ in listener.received} == {'/image', IMU}
     assert bytes(listener.messages('/image')[0].data) == make_image(100).tobytes()
     arrivals = listener.arrivals('/image')
     assert -0.05 < arrivals[-1] - arrivals[0] - 2 * (FRAMES - 1) * FRAME_NS / 1e9 < 3.0
@@ -147,13 +148,13 @@ def test_loop_and_clock(bags):
         output, problems = player.communicate(timeout=2.0)
     assert player.returncode == 0, problems
     assert 'loop 3' in problems and 'interrupted' in output
-    heard = stamps(listener, CAM0)
-    assert heard[:2 * FRAMES + 3] == STAMPS_NS * 2 + STAMPS_NS[:3]
+    played_stamps = stamps(listener, CAM0)
+    assert played_stamps[:2 * FRAMES + 3] == STAMPS_NS * 2 + STAMPS_NS[:3]
     times = np.array([message.clock.sec * NANOSECONDS + message.clock.nanosec
                       for message in listener.messages('/clock')])
     assert (times >= START_NS + LATER_NS).all() and (times < START_NS + NANOSECONDS).all()
     back = np.flatnonzero(np.diff(times) <= 0)
-    assert len(back) == 2  # only where a loop begins
+    assert len(back) == 2  # only at the start of a loop
     assert (times[back + 1] < START_NS + LATER_NS + FRAME_NS).all()
     steps = np.delete(np.diff(times), back)
     assert 8e6 < np.median(steps) < 12e6  # 100 Hz
@@ -169,17 +170,17 @@ def qos(reliable: bool, latched: bool, depth: int = 5) -> Qos:
 
 @pytest.mark.parametrize('storage', STORAGES)
 def test_recorded_qos_is_offered(storage, tmp_path):
-    writer = BagWriter(storage)
+    writer = BagBuilder(storage)
     writer.offers = {'/best': {'latching': 0}, '/latched': {'latching': 1}}
     if not writer.is_ros1:
         writer.offers = {'/best': {'offered_qos_profiles': [qos(False, False)]},
                          '/latched': {'offered_qos_profiles': [qos(True, True)]}}
     records = [(topic, START_NS + index * NANOSECONDS, writer.point_stamped(START_NS, POSES[0]))
-               for index in range(60) for topic in ('/best', '/latched', '/unsaid')]
+               for index in range(60) for topic in ('/best', '/latched', '/default')]
     bag = writer.write(tmp_path / 'bag', records)
     with Listener({}) as listener, running_module(PLAY, bag):
         find = listener.node.get_publishers_info_by_topic
-        topics = ('/best', '/latched', '/unsaid')
+        topics = ('/best', '/latched', '/default')
         wait_until(lambda: all(map(find, topics)))
         offered = {topic: find(topic)[0].qos_profile for topic in topics}
     best = 'RELIABLE' if writer.is_ros1 else 'BEST_EFFORT'
@@ -188,16 +189,16 @@ def test_recorded_qos_is_offered(storage, tmp_path):
         (best, 'VOLATILE'), ('RELIABLE', 'TRANSIENT_LOCAL'), ('RELIABLE', 'VOLATILE')]
 
 
-def test_best_effort_subscribers_get_the_last_message_too(bags):
+def test_best_effort_subscribers_receive_the_last_message(bags):
     from rclpy.qos import qos_profile_sensor_data
     with Listener({CAM0: sensor_msgs.Image}, qos_profile_sensor_data) as listener:
         played(run_module(PLAY, bags['mcap'], '--wait-for-subscribers'))
         wait_until(lambda: stamps(listener, CAM0)[-1:] == STAMPS_NS[-1:])
 
 
-def test_topics_that_cannot_be_published_are_left_out(tmp_path):
-    """Of a type that nobody installed, or that ROS 2 defines otherwise (Range has a variance)."""
-    writer = BagWriter('ros1')
+def test_unpublishable_topics_are_left_out(tmp_path):
+    """Types that are not installed or differ in ROS 2 (Range has a variance there)."""
+    writer = BagBuilder('ros1')
     writer.store.register(get_types_from_msg('uint8 level', 'acme_msgs/msg/Gadget'))
     reading = writer.make('sensor_msgs/Range', header=writer.header(START_NS), radiation_type=0,
                           field_of_view=1.0, min_range=0.0, max_range=9.0, range=3.0)
@@ -223,7 +224,7 @@ def test_topics_that_cannot_be_published_are_left_out(tmp_path):
 def test_interrupted_while_playing(sent, bags):
     with Listener({CAM0: sensor_msgs.Image}) as listener, running_module(
             PLAY, bags['ros1'], '--rate', '0.1') as player:
-        wait_until(lambda: listener.heard)
+        wait_until(lambda: listener.received)
         player.send_signal(sent)
         output, problems = player.communicate(timeout=2.0)
     assert player.returncode == 0, problems
@@ -231,12 +232,12 @@ def test_interrupted_while_playing(sent, bags):
     assert 'messages published, interrupted at' in output
 
 
-def test_waiting_tells_for_what_and_can_be_interrupted(bags):
+def test_waiting_for_subscribers_is_logged_and_can_be_interrupted(bags):
     with Listener({CAM0: sensor_msgs.Image}) as listener, running_module(
             PLAY, bags['ros1'], '--wait-for-subscribers', '2') as player:
         line = next(line for line in player.stderr if 'waiting' in line)
         assert f'waiting for 2 subscribers on {CAM0}' in line
-        assert not listener.heard
+        assert not listener.received
         player.send_signal(signal.SIGTERM)
         began = time.monotonic()
         _, problems = player.communicate(timeout=10.0)
@@ -255,12 +256,12 @@ def test_waiting_tells_for_what_and_can_be_interrupted(bags):
     (['{bag}', '--ros-args', '-r', 'nonsense'], ['ROS', 'nonsense']),
     ([__file__], ['cannot read the bag', __file__]),
 ])
-def test_what_cannot_be_is_told_in_one_line(arguments, parts, bags):
+def test_invalid_arguments_end_in_one_line(arguments, parts, bags):
     done = run_module(PLAY, *[text.format(bag=bags['ros1']) for text in arguments])
     assert_one_readable_line(done, *parts)
 
 
-def test_a_bag_damaged_in_the_middle_is_played_until_there(bags, tmp_path):
+def test_a_bag_damaged_in_the_middle_is_played_up_to_there(bags, tmp_path):
     data = bytearray(bags['ros1'].read_bytes())
     middle = len(data) // 2
     data[middle:middle + 4000] = b'\xff' * 4000  # at least one message and its header
@@ -268,5 +269,17 @@ def test_a_bag_damaged_in_the_middle_is_played_until_there(bags, tmp_path):
     with Listener(EUROC) as listener:
         line = one_readable_line(run_module(PLAY, tmp_path / 'walk.bag', '--wait-for-subscribers'))
     assert 'cannot read the bag' in line and 'walk.bag' in line
-    heard = stamps(listener, CAM0)
-    assert 0 < len(heard) < FRAMES and heard == STAMPS_NS[:len(heard)]
+    played_stamps = stamps(listener, CAM0)
+    assert 0 < len(played_stamps) < FRAMES and played_stamps == STAMPS_NS[:len(played_stamps)]
+
+
+def test_without_rclpy_one_line_shows_how_to_install_it(bags):
+    code = ("import sys; sys.modules['rclpy'] = None; from kfvo_ros.play import main; "
+            'sys.exit(main(sys.argv[1:]))')
+    for arguments in ([], ['--ros-args', '-r', 'a:=b']):
+        done = subprocess.run([sys.executable, '-c', code, str(bags['ros1']), *arguments],
+                              text=True, capture_output=True, env=ENVIRONMENT, timeout=60)
+        assert done.returncode == 1
+        line, = done.stderr.splitlines()
+        assert 'rclpy is missing: source /opt/ros/jazzy/setup.bash' in line
+        assert "pip install 'kfvo_ros[ros]'" in line

@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Ground truth in bags: every type of message, which one is taken, and how it is moved."""
+"""Ground truth in bags: message types, choice of the topic, and transform to the camera."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from bag_writers import (
     COUNT,
-    EASY,
+    PINHOLE,
     POSES,
     STAMPS_NS,
     START_NS,
     STORAGES,
-    BagWriter,
+    BagBuilder,
     Records,
     images,
     open_bag,
@@ -33,7 +33,7 @@ T_BODY_CAMERA, T_BODY_MOUNT, T_MOUNT_CAMERA = (make_poses(1, seed)[0] for seed i
 every_storage = pytest.mark.parametrize('storage', STORAGES)
 
 
-def check(truth: GroundTruth, frame: str, poses: np.ndarray) -> None:
+def assert_poses(truth: GroundTruth, frame: str, poses: np.ndarray) -> None:
     assert truth.frame == frame and truth.trajectory.has_rotation
     assert truth.trajectory.stamps_ns.tolist() == STAMPS_NS
     np.testing.assert_allclose(truth.trajectory.poses, poses, atol=1e-12)
@@ -44,18 +44,19 @@ def check(truth: GroundTruth, frame: str, poses: np.ndarray) -> None:
     ('transform', 'body')])
 @every_storage
 def test_pose_topics(storage, kind, frame, tmp_path):
-    """A pose is of the frame its message names, until something says where the camera is."""
-    writer = BagWriter(storage)
+    """A pose belongs to the frame that its message names, unless the camera is located on it."""
+    writer = BagBuilder(storage)
     sequence = open_bag(writer, tmp_path, images(writer),
                         truth_records(writer, '/truth', getattr(writer, kind)))
-    check(sequence.ground_truth(), frame, POSES)
-    moved = open_sequence(str(sequence._path), camera=EASY, ground_truth_to_camera=T_BODY_CAMERA)
-    check(moved.ground_truth(), 'camera', POSES @ T_BODY_CAMERA)
+    assert_poses(sequence.ground_truth(), frame, POSES)
+    located = open_sequence(str(sequence._path), camera=PINHOLE,
+                            ground_truth_to_camera=T_BODY_CAMERA)
+    assert_poses(located.ground_truth(), 'camera', POSES @ T_BODY_CAMERA)
 
 
 @every_storage
-def test_points_have_no_rotation_and_cannot_be_moved(storage, tmp_path):
-    writer = BagWriter(storage)
+def test_points_have_no_rotation_and_stay_at_the_prism(storage, tmp_path):
+    writer = BagBuilder(storage)
     sequence = open_bag(writer, tmp_path, images(writer),
                         truth_records(writer, '/leica/position', writer.point_stamped),
                         ground_truth_to_camera=T_BODY_CAMERA)
@@ -65,8 +66,8 @@ def test_points_have_no_rotation_and_cannot_be_moved(storage, tmp_path):
     np.testing.assert_array_equal(truth.trajectory.positions, POSES[:, :3, 3])
 
 
-def static_chain(writer: BagWriter) -> Records:
-    """Return body -> mount -> camera on /tf_static, and a frame that hangs elsewhere."""
+def static_chain(writer: BagBuilder) -> Records:
+    """Return body -> mount -> camera on /tf_static, and an unconnected transform."""
     still = [writer.transform(START_NS, T_BODY_MOUNT, 'mount', 'body'),
              writer.transform(START_NS, T_MOUNT_CAMERA, 'camera', 'mount'),
              writer.transform(START_NS, np.eye(4), 'tool', 'arm')]
@@ -75,61 +76,61 @@ def static_chain(writer: BagWriter) -> Records:
 
 @pytest.mark.parametrize('kind', ['odometry', 'transform'])
 @every_storage
-def test_truth_is_moved_by_static_transforms(storage, kind, tmp_path):
-    writer = BagWriter(storage)
+def test_static_transforms_lead_to_the_camera(storage, kind, tmp_path):
+    writer = BagBuilder(storage)
     truth = truth_records(writer, '/truth', getattr(writer, kind))
     sequence = open_bag(writer, tmp_path, images(writer), truth, static_chain(writer))
-    check(sequence.ground_truth(), 'camera', POSES @ T_BODY_MOUNT @ T_MOUNT_CAMERA)
-    explicit = open_sequence(str(sequence._path), camera=EASY,
+    assert_poses(sequence.ground_truth(), 'camera', POSES @ T_BODY_MOUNT @ T_MOUNT_CAMERA)
+    explicit = open_sequence(str(sequence._path), camera=PINHOLE,
                              ground_truth_to_camera=T_BODY_CAMERA)
-    check(explicit.ground_truth(), 'camera', POSES @ T_BODY_CAMERA)
+    assert_poses(explicit.ground_truth(), 'camera', POSES @ T_BODY_CAMERA)
 
 
 def test_the_camera_may_be_the_parent_of_the_measured_frame(tmp_path):
-    writer = BagWriter('mcap')
+    writer = BagBuilder('mcap')
     marker = writer.transform(START_NS, geometry.invert(T_BODY_CAMERA), 'body', 'camera')
     sequence = open_bag(writer, tmp_path, images(writer),
                         truth_records(writer, '/truth', writer.odometry),
                         [('/tf_static', START_NS, writer.transforms(marker))])
-    check(sequence.ground_truth(), 'camera', POSES @ T_BODY_CAMERA)
+    assert_poses(sequence.ground_truth(), 'camera', POSES @ T_BODY_CAMERA)
 
 
-def test_a_chain_that_does_not_reach_the_camera(tmp_path):
-    writer = BagWriter('mcap')
+def test_disconnected_transforms_leave_the_poses_at_the_body(tmp_path):
+    writer = BagBuilder('mcap')
     loop = [writer.transform(START_NS, np.eye(4), *pair)
             for pair in (('body', 'mount'), ('mount', 'body'), ('camera', 'tripod'))]
     loop.append(writer.transform(START_NS, np.eye(4), 'camera', 'body'))
-    loop[-1].transform.rotation.w = 0.0  # no rotation at all: as if it were not there
+    loop[-1].transform.rotation.w = 0.0  # no rotation: the transform is ignored
     sequence = open_bag(writer, tmp_path, images(writer),
                         truth_records(writer, '/truth', writer.odometry),
                         [('/tf_static', START_NS, writer.transforms(*loop))])
-    check(sequence.ground_truth(), 'body', POSES)
+    assert_poses(sequence.ground_truth(), 'body', POSES)
 
 
-def test_a_camera_that_turns_on_the_body_is_not_fixed_to_it(tmp_path):
-    writer = BagWriter('mcap')
+def test_a_moving_camera_mount_is_not_a_fixed_transform(tmp_path):
+    writer = BagBuilder('mcap')
     turning = [('/tf', stamp, writer.transforms(writer.transform(stamp, pose, 'camera', 'body')))
                for stamp, pose in zip(STAMPS_NS, make_poses(COUNT, 5))]
     sequence = open_bag(writer, tmp_path, images(writer), turning,
                         truth_records(writer, '/truth', writer.odometry))
-    check(sequence.ground_truth(), 'body', POSES)
+    assert_poses(sequence.ground_truth(), 'body', POSES)
 
 
-def test_truth_of_the_camera_itself_needs_no_transform(tmp_path):
-    writer = BagWriter('mcap')
+def test_ground_truth_of_the_camera_needs_no_transform(tmp_path):
+    writer = BagBuilder('mcap')
     truth = [(topic, stamp, writer.odometry(message.header.stamp.sec * 10 ** 9 +
                                             message.header.stamp.nanosec, pose, 'camera'))
              for (topic, stamp, message), pose in zip(
                  truth_records(writer, '/truth', writer.odometry), POSES)]
-    check(open_bag(writer, tmp_path, images(writer), truth).ground_truth(), 'camera', POSES)
+    assert_poses(open_bag(writer, tmp_path, images(writer), truth).ground_truth(), 'camera', POSES)
 
 
 @pytest.mark.parametrize(('storage', 'kind'), [
     ('ros1', 'tf/tfMessage'), ('ros1', 'tf2_msgs/TFMessage'), ('sqlite3', 'tf2_msgs/TFMessage'),
     ('mcap', 'tf2_msgs/TFMessage')])
-def test_transforms_as_in_the_bags_of_tum(storage, kind, tmp_path):
-    """The world moves to the kinect; fixed transforms come again and again beside it on /tf."""
-    writer = BagWriter(storage)
+def test_transforms_of_the_tum_bags(storage, kind, tmp_path):
+    """/tf has the moving world -> kinect and, repeatedly, the fixed transforms below it."""
+    writer = BagBuilder(storage)
     slash = '/' if writer.is_ros1 else ''
     records = []
     for stamp, pose in zip(STAMPS_NS, POSES):
@@ -140,51 +141,52 @@ def test_transforms_as_in_the_bags_of_tum(storage, kind, tmp_path):
         records += [('/tf', stamp + 7, writer.transforms(*fixed, kind=kind)),
                     ('/tf', stamp + 9, writer.transforms(*moving, kind=kind))]
     sequence = open_bag(writer, tmp_path, images(writer, frame_id=f'{slash}camera'), records)
-    check(sequence.ground_truth(), 'camera', POSES @ T_BODY_MOUNT @ T_MOUNT_CAMERA)
+    assert_poses(sequence.ground_truth(), 'camera', POSES @ T_BODY_MOUNT @ T_MOUNT_CAMERA)
 
 
-def test_transforms_that_do_not_reach_the_camera_name_their_frame(tmp_path):
-    writer = BagWriter('mcap')
+def test_a_transform_not_connected_to_the_camera_names_its_frame(tmp_path):
+    writer = BagBuilder('mcap')
     records = truth_records(writer, '/tf', lambda stamp, pose: writer.transforms(
         writer.transform(stamp, pose, 'kinect')))
-    check(open_bag(writer, tmp_path, images(writer), records).ground_truth(), 'kinect', POSES)
+    sequence = open_bag(writer, tmp_path, images(writer), records)
+    assert_poses(sequence.ground_truth(), 'kinect', POSES)
 
 
-def test_transforms_that_stand_still_are_no_truth(tmp_path):
-    writer = BagWriter('mcap')
+def test_static_transforms_are_no_ground_truth(tmp_path):
+    writer = BagBuilder('mcap')
     records = truth_records(writer, '/tf', lambda stamp, pose: writer.transforms(
         writer.transform(stamp, T_BODY_MOUNT)))
     assert open_bag(writer, tmp_path, images(writer), records).ground_truth() is None
-    asked = open_sequence(str(tmp_path / 'walk'), camera=EASY, ground_truth_topic='/tf')
+    requested = open_sequence(str(tmp_path / 'walk'), camera=PINHOLE, ground_truth_topic='/tf')
     with pytest.raises(KfvoError, match='expected a moving transform on /tf, found none'):
-        asked.ground_truth()
+        requested.ground_truth()
 
 
-def test_ground_truth_topics(tmp_path, caplog):
-    """By type, then by name; or the one that is asked for."""
+def test_choice_of_the_ground_truth_topic(tmp_path, caplog):
+    """The default is the first by type, then by name; a requested topic wins."""
     caplog.set_level(logging.INFO)
-    writer = BagWriter('mcap')
+    writer = BagBuilder('mcap')
     others = {'/a/point': writer.point_stamped, '/b/transform': writer.transform,
               '/d/odometry': writer.odometry, '/c/odometry': writer.odometry,
               '/e/pose': writer.pose_stamped}
     sequence = open_bag(writer, tmp_path, images(writer), static_chain(writer), *(
         truth_records(writer, topic, make, make_poses(COUNT, seed))
         for seed, (topic, make) in enumerate(others.items())))
-    moved = make_poses(COUNT, 3) @ T_BODY_MOUNT @ T_MOUNT_CAMERA
-    check(sequence.ground_truth(), 'camera', moved)
+    T_world_camera = make_poses(COUNT, 3) @ T_BODY_MOUNT @ T_MOUNT_CAMERA
+    assert_poses(sequence.ground_truth(), 'camera', T_world_camera)
     choice = next(record.message for record in caplog.records if 'candidates' in record.message)
     assert '/c/odometry is taken' in choice
     assert choice.endswith('other candidates: /d/odometry, /e/pose, /b/transform, /a/point')
     bag = str(tmp_path / 'walk')
-    asked = open_sequence(bag, camera=EASY, ground_truth_topic='e/pose')
-    check(asked.ground_truth(), '/e/pose', make_poses(COUNT, 4))
-    wrong = open_sequence(bag, camera=EASY, ground_truth_topic='/cam0/image_raw')
+    requested = open_sequence(bag, camera=PINHOLE, ground_truth_topic='e/pose')
+    assert_poses(requested.ground_truth(), '/e/pose', make_poses(COUNT, 4))
+    wrong = open_sequence(bag, camera=PINHOLE, ground_truth_topic='/cam0/image_raw')
     with pytest.raises(KfvoError, match='/cam0/image_raw holds no poses.*these do: /a/point'):
         wrong.ground_truth()
 
 
-def test_lost_moments_of_motion_capture_are_left_out(tmp_path):
-    writer = BagWriter('mcap')
+def test_invalid_poses_of_motion_capture_are_left_out(tmp_path):
+    writer = BagBuilder('mcap')
     records = truth_records(writer, '/truth', writer.pose_stamped)
     records[1][2].pose.position.x = float('nan')
     orientation = records[3][2].pose.orientation
@@ -194,19 +196,19 @@ def test_lost_moments_of_motion_capture_are_left_out(tmp_path):
     np.testing.assert_allclose(truth.trajectory.poses, POSES[[0, 2, 4]], atol=1e-12)
 
 
-def test_a_motion_capture_that_never_saw_the_body(tmp_path):
-    writer = BagWriter('mcap')
+def test_motion_capture_without_a_valid_pose(tmp_path):
+    writer = BagBuilder('mcap')
     records = truth_records(writer, '/truth', writer.pose_stamped)
     for _, _, message in records:
         message.pose.position.x = float('nan')
     assert open_bag(writer, tmp_path, images(writer), records).ground_truth() is None
-    asked = open_sequence(str(tmp_path / 'walk'), camera=EASY, ground_truth_topic='/truth')
+    requested = open_sequence(str(tmp_path / 'walk'), camera=PINHOLE, ground_truth_topic='/truth')
     with pytest.raises(KfvoError, match='expected a pose.* on /truth, found none'):
-        asked.ground_truth()
+        requested.ground_truth()
 
 
 @pytest.mark.parametrize('matrix', [2 * np.eye(4), np.diag([1.0, 1, -1, 1]), np.eye(3), 'x'])
 def test_a_transform_that_is_not_rigid_is_refused(matrix, tmp_path):
-    writer = BagWriter('mcap')
+    writer = BagBuilder('mcap')
     with pytest.raises(KfvoError, match='ground truth to camera.*expected a rigid 4x4'):
         open_bag(writer, tmp_path, images(writer), ground_truth_to_camera=matrix)

@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Datasets with a defect: refused in one line that names the file."""
+"""Datasets with a defect raise a one-line KfvoError that names the file."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from kfvo_ros.sequences import open_sequence
 
 
 def broken_datasets() -> dict[str, tuple[str, str, str | None, str]]:
-    """Return case -> (dataset, file, its new text or None to delete it, the complaint)."""
+    """Return case -> (dataset, file, new text or None to delete it, expected message)."""
     return {
         'image missing': ('euroc', f'mav0/cam0/data/{1403715273262142976 + 50_000_001}.png', None,
                           r'cannot read the image .*1403715273312142977\.png'),
@@ -28,14 +28,14 @@ def broken_datasets() -> dict[str, tuple[str, str, str | None, str]]:
         'times.txt': ('kitti', 'times.txt', '0\nnan', r'times\.txt, line 2'),
         'sensor.yaml': ('euroc', 'mav0/cam0/sensor.yaml', 'resolution: [32, 24]',
                         r"sensor\.yaml: expected resolution.*'intrinsics'"),
-        'sensor.yaml no YAML': ('euroc', 'mav0/cam0/sensor.yaml', 'a: [', r'sensor\.yaml'),
-        'sensor.yaml deep': ('euroc', 'mav0/cam0/sensor.yaml', 'a: ' + '[' * 5000,
+        'sensor.yaml not YAML': ('euroc', 'mav0/cam0/sensor.yaml', 'a: [', r'sensor\.yaml'),
+        'sensor.yaml nested': ('euroc', 'mav0/cam0/sensor.yaml', 'a: ' + '[' * 5000,
                              r'cannot read .*sensor\.yaml'),
-        'sensor.yaml no date': ('euroc', 'mav0/cam0/sensor.yaml', 'a: 2001-13-45',
+        'sensor.yaml bad date': ('euroc', 'mav0/cam0/sensor.yaml', 'a: 2001-13-45',
                                 r'cannot read .*sensor\.yaml: month'),
-        'sensor.yaml no int': ('euroc', 'mav0/cam0/sensor.yaml', 'a: !!int foo',
+        'sensor.yaml bad int': ('euroc', 'mav0/cam0/sensor.yaml', 'a: !!int foo',
                                r"cannot read .*sensor\.yaml: .*'foo'"),
-        'sensor.yaml no end': ('euroc', 'mav0/cam0/sensor.yaml', 'resolution: [.inf, 24]',
+        'sensor.yaml infinite': ('euroc', 'mav0/cam0/sensor.yaml', 'resolution: [.inf, 24]',
                                r'sensor\.yaml: expected resolution.*infinity'),
         'sensor.yaml a list': ('euroc', 'mav0/cam0/sensor.yaml', '[1]', r'sensor\.yaml.*keys'),
         'calib.txt': ('kitti', 'calib.txt', 'P0: 1 2 3', r'calib\.txt, line 1.*12 numbers'),
@@ -45,18 +45,18 @@ def broken_datasets() -> dict[str, tuple[str, str, str | None, str]]:
 
 
 @pytest.mark.parametrize('case', broken_datasets())
-def test_broken_datasets_are_refused_by_name(case, tmp_path):
-    kind, file_name, text, complaint = broken_datasets()[case]
+def test_an_error_names_the_broken_file(case, tmp_path):
+    kind, file_name, text, message = broken_datasets()[case]
     path, _ = write_dataset(kind, tmp_path)
     (path / file_name).unlink()
     if text is not None:
         write_text(path / file_name, text)
-    with pytest.raises(KfvoError, match=complaint) as caught:
+    with pytest.raises(KfvoError, match=message) as caught:
         list(open_sequence(str(path)))
     assert '\n' not in str(caught.value)
 
 
-@pytest.mark.parametrize(('kind', 'file_name', 'text', 'complaint'), [
+@pytest.mark.parametrize(('kind', 'file_name', 'text', 'message'), [
     ('euroc', 'mav0/state_groundtruth_estimate0/data.csv', '1,2,3', r'line 1.*q w x y z'),
     ('euroc', 'mav0/state_groundtruth_estimate0/data.csv', '1,2,3,4,0,0,0,0', 'line 1'),
     ('euroc', 'mav0/cam0/sensor.yaml', 'T_BS: {data: [1, 2]}', r'T_BS: expected a rigid 4x4'),
@@ -66,11 +66,11 @@ def test_broken_datasets_are_refused_by_name(case, tmp_path):
     ('tartanair', 'pose_left.txt', '0 0 inf 0 0 0 1', r'pose_left\.txt, line 1'),
     ('kitti', '../../poses/03.txt', '1 0 0 0 0 1 0 0 0 0 1 0', '1 poses for 4 frames'),
 ])
-def test_broken_ground_truth_is_refused_by_name(kind, file_name, text, complaint, tmp_path):
+def test_an_error_names_the_broken_ground_truth(kind, file_name, text, message, tmp_path):
     path, _ = write_dataset(kind, tmp_path)
     sequence = open_sequence(str(path))
     write_text(path / file_name, text)
-    with pytest.raises(KfvoError, match=complaint):
+    with pytest.raises(KfvoError, match=message):
         sequence.ground_truth()
 
 

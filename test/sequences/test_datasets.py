@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Datasets: read back as they were written, with the calibration and the truth they come with."""
+"""Datasets read back with their stamps, images, calibration and ground truth."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from sequence_writers import (
 from kfvo_ros.camera import Camera
 from kfvo_ros.sequences import open_sequence
 
-EASY = Camera(WIDTH, HEIGHT, 99.0, 99.0, 16.0, 12.0)
+PINHOLE = Camera(WIDTH, HEIGHT, 99.0, 99.0, 16.0, 12.0)
 
 every_dataset = pytest.mark.parametrize('kind', DATASETS)
 
@@ -33,7 +33,7 @@ every_dataset = pytest.mark.parametrize('kind', DATASETS)
 def test_datasets_read_back(kind, colour, tmp_path):
     path, stamps_ns = write_dataset(kind, tmp_path, colour)
     sequence = open_sequence(str(path))
-    for _ in range(2):  # as often as you like
+    for _ in range(2):
         frames = list(sequence)
         assert [frame.stamp_ns for frame in frames] == stamps_ns
         assert all(type(frame.stamp_ns) is int for frame in frames)
@@ -74,7 +74,7 @@ def test_tum_cameras_by_name(folder, fx, tmp_path):
     assert camera.guessed if fx is None else camera.fx == fx
 
 
-def test_euroc_opens_by_mav0_too(tmp_path, monkeypatch):
+def test_euroc_opens_by_mav0(tmp_path, monkeypatch):
     path, stamps_ns = write_dataset('euroc', tmp_path)
     write_camera_info(path, 77.0)
     by_parent = open_sequence(str(path))
@@ -85,8 +85,8 @@ def test_euroc_opens_by_mav0_too(tmp_path, monkeypatch):
     assert [frame.stamp_ns for frame in by_mav0] == stamps_ns
 
 
-def test_kitti_falls_back_to_colour(tmp_path):
-    """image_2 has its own P2, and stands beside the camera 0 that the poses are of."""
+def test_kitti_without_grey_images_uses_colour(tmp_path):
+    """image_2 has its own P2 and an offset from camera 0, whose poses the file holds."""
     images = [make_image(index, colour=True) for index in range(LENGTH)]
     path, _ = write_kitti(tmp_path, images, make_poses(LENGTH), camera='image_2')
     sequence = open_sequence(str(path))
@@ -94,18 +94,18 @@ def test_kitti_falls_back_to_colour(tmp_path):
     np.testing.assert_allclose(sequence.ground_truth().trajectory.poses, make_poses(LENGTH),
                                atol=1e-12)
     write_kitti(tmp_path, [make_image(9)] * LENGTH, make_poses(LENGTH))
-    assert open_sequence(str(path)).camera.fx == 30.0  # grey once it is there
+    assert open_sequence(str(path)).camera.fx == 30.0  # grey images are preferred
 
 
 @every_dataset
 def test_camera_precedence(kind, tmp_path, caplog):
-    """The user's, then the file's, then the dataset's own; none of them is a guess."""
+    """The user's camera precedes camera_info.yaml, which precedes the dataset's own."""
     path, _ = write_dataset(kind, tmp_path)
-    own = open_sequence(str(path)).camera
+    dataset_camera = open_sequence(str(path)).camera
     write_camera_info(path, 55.0)
-    assert open_sequence(str(path)).camera.fx == 55.0 != own.fx
-    assert open_sequence(str(path), camera=EASY).camera == EASY
-    assert not own.guessed and not caplog.records
+    assert open_sequence(str(path)).camera.fx == 55.0 != dataset_camera.fx
+    assert open_sequence(str(path), camera=PINHOLE).camera == PINHOLE
+    assert not dataset_camera.guessed and not caplog.records
 
 
 def test_no_ground_truth(tmp_path):
@@ -117,7 +117,7 @@ def test_no_ground_truth(tmp_path):
         assert open_sequence(str(path), kind=kind).ground_truth() is None
 
 
-def test_stamps_that_do_not_increase_are_left_out_with_one_warning(tmp_path, caplog):
+def test_stamps_that_do_not_increase_are_dropped_with_one_warning(tmp_path, caplog):
     path, stamps_ns = write_dataset('tum', tmp_path)
     lines = (path / 'rgb.txt').read_text().splitlines()
     write_text(path / 'rgb.txt', *lines[:4], lines[3], lines[2], *lines[4:])

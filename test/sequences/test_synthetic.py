@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Rendered sequences: the same bytes for ever, exact geometry, and hard enough to matter."""
+"""Rendered sequences: fixed bytes, exact geometry, and difficulty."""
 
 import json
 import tracemalloc
@@ -13,7 +13,7 @@ from kfvo_ros import geometry, run
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.sequences.synthetic.sequence import SyntheticSequence, parse_synthetic
 from kfvo_ros.tracking import search
-from kfvo_ros.tracking.tracker import Tracker, common
+from kfvo_ros.tracking.tracker import Tracker, common_pixels
 
 CHECKSUMS = {(0, 'smooth'): 0x8502720a, (1, 'fast'): 0xaf7b44c2, (7, 'mixed'): 0x5b5b70fb,
              (2, 'street'): 0x6becd4e2}
@@ -21,7 +21,7 @@ CHECKSUMS = {(0, 'smooth'): 0x8502720a, (1, 'fast'): 0xaf7b44c2, (7, 'mixed'): 0
 
 
 @pytest.mark.parametrize(('seed', 'style'), list(CHECKSUMS))
-def test_same_seed_same_bytes_for_ever(seed, style):
+def test_bytes_of_a_seed_are_fixed(seed, style):
     sequence = SyntheticSequence(seed, style, 61, 320, 240)
     checksum = 0
     for index in (0, 7, 60):
@@ -39,7 +39,7 @@ def test_frames_do_not_depend_on_the_order_or_the_length():
 
 
 @pytest.mark.parametrize(('style', 'rate'), [('smooth', 30), ('street', 10)])
-def test_stamps_are_so_many_a_second_and_match_the_truth(style, rate):
+def test_frame_rate_and_ground_truth_stamps(style, rate):
     sequence = SyntheticSequence(0, style, 31, 64, 48)
     stamps = np.array([frame.stamp_ns for frame in sequence])
     np.testing.assert_array_equal(stamps, sequence.ground_truth().trajectory.stamps_ns)
@@ -47,8 +47,8 @@ def test_stamps_are_so_many_a_second_and_match_the_truth(style, rate):
     assert sequence.length == 31 and sequence.ground_truth().frame == 'camera'
 
 
-def test_depth_and_pose_predict_where_pixels_go():
-    """What two frames see of one point has the same brightness, up to noise and gain."""
+def test_depth_and_pose_predict_the_reprojection():
+    """A point has the same brightness in two frames, up to noise and gain."""
     sequence = SyntheticSequence(1, 'smooth', 6, 320, 240)
     first, second = sequence.frame(0), sequence.frame(5)
     rows, columns = np.mgrid[20:220:10, 20:300:10].reshape(2, -1)
@@ -58,9 +58,9 @@ def test_depth_and_pose_predict_where_pixels_go():
     T_second_first = geometry.relative(poses[5], poses[0])
     points = rays * sequence.depth(0)[rows, columns, None] @ T_second_first[:3, :3].T
     points += T_second_first[:3, 3]
-    seen = sequence.camera.distort(points[:, :2] / points[:, 2:])
-    inside = ((seen > 2) & (seen < (317, 237))).all(axis=1)
-    x, y = seen[inside].round().astype(int).T
+    projected = sequence.camera.distort(points[:, :2] / points[:, 2:])
+    inside = ((projected > 2) & (projected < (317, 237))).all(axis=1)
+    x, y = projected[inside].round().astype(int).T
     visible = np.abs(sequence.depth(5)[y, x] - points[inside, 2]) < 0.05
     assert visible.sum() > 200
     difference = (first.image[rows[inside], columns[inside]].astype(float)
@@ -83,7 +83,7 @@ def test_memory_does_not_grow_with_length():
 
 @pytest.mark.parametrize('text', ['synthetic:', 'synthetic:x', 'synthetic:1:slow', 'synthetic:-1',
                                   'synthetic:1:smooth:2', 'synthetic:99999999999'])
-def test_malformed_names_say_what_is_expected(text):
+def test_malformed_names_are_rejected(text):
     with pytest.raises(KfvoError, match='expected'):
         parse_synthetic(text)
 
@@ -93,8 +93,8 @@ def test_names_are_parsed():
     assert parse_synthetic('synthetic:7:fast').name == 'synthetic:7:fast'
 
 
-def test_pure_rotation_is_short():
-    """Where the camera turns on the spot it turns by 40 degrees at most."""
+def test_pure_rotation_is_limited():
+    """A rotation without translation is 40 degrees at most."""
     for seed in range(10):
         poses = SyntheticSequence(seed, 'mixed').ground_truth().trajectory.poses
         resting = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1) < 5e-4
@@ -105,20 +105,20 @@ def test_pure_rotation_is_short():
             assert np.degrees(turned) <= 40.0
 
 
-@pytest.mark.parametrize(('style', 'least_life'), [
+@pytest.mark.parametrize(('style', 'min_lifetime'), [
     ('smooth', 4.0), ('fast', 4.0), ('mixed', 4.0), ('street', 3.0)])
-def test_difficulty_of_seeds_0_to_9(style, least_life):
-    """Mean flow of 5 to 25 px a frame and tracks that live 4 to 15 frames: no easy pictures.
+def test_difficulty_of_seeds_0_to_9(style, min_lifetime):
+    """Mean flow of 5 to 25 px per frame and track lifetimes of 4 to 15 frames.
 
-    At 10 Hz, in a street, they live 3 at least.
+    In a street, at 10 Hz, the lower limit is 3.
     """
-    flows, lives = zip(*(_measure(seed, style) for seed in range(10)), strict=True)
+    flows, lifetimes = zip(*(_measure(seed, style) for seed in range(10)), strict=True)
     assert 5.0 < np.mean(flows) < 25.0, flows
-    assert least_life < np.mean(lives) < 15.0, lives
+    assert min_lifetime < np.mean(lifetimes) < 15.0, lifetimes
 
 
-def test_a_street_is_driven_as_a_car_can():
-    """It looks ahead, stops and goes, and takes corners at up to 60 degrees a second."""
+def test_street_motion_is_that_of_a_car():
+    """The camera looks ahead, stops and starts, and turns at up to 60 degrees per second."""
     for seed in range(10):
         sequence = SyntheticSequence(seed, 'street')
         poses = sequence.ground_truth().trajectory.poses
@@ -134,14 +134,14 @@ def test_a_street_is_driven_as_a_car_can():
         assert sequence.depth(0).min() > 1.0 and 20.0 < sequence.depth(0).max() < 500.0
 
 
-def test_mixed_seeds_defeat_who_searches_where_points_were(tmp_path, monkeypatch):
-    """An easy renderer would prove nothing: keyframes every 50 px lose over 3 % of the path.
+def test_mixed_seeds_defeat_a_search_without_prediction(tmp_path, monkeypatch):
+    """A search for tracks at their last position gives an ATE over 3 % of the path.
 
-    They do where nothing is expected of the motion; the last one and the shift of the whole
-    image, which lead the search, save them.
+    Keyframes are 50 px of flow apart. Tracks survive where the search starts from the last
+    motion or the shift of the whole image.
     """
-    monkeypatch.setattr(search.TrackSearch, '_guesses', lambda *_: iter([]))
-    monkeypatch.setattr(search, 'MOST', 0.0)
+    monkeypatch.setattr(search.TrackSearch, '_predictions', lambda *_: iter([]))
+    monkeypatch.setattr(search, 'CERTAIN_FROM', 0.0)
     failed = 0
     for seed in (5, 7):
         assert run.main([f'synthetic:{seed}:mixed', '--keyframes', 'optical_flow', '--output',
@@ -152,14 +152,14 @@ def test_mixed_seeds_defeat_who_searches_where_points_were(tmp_path, monkeypatch
 
 
 def _measure(seed: int, style: str) -> tuple[float, float]:
-    """Return the mean flow [px per frame at 640x480] and the mean life of tracks that ended."""
-    tracker, last, flows, born, lives = Tracker(), None, [], {}, []
+    """Return the mean flow [px/frame] at 640x480 and the mean lifetime of ended tracks."""
+    tracker, last, flows, born, lifetimes = Tracker(), None, [], {}, []
     for index, frame in enumerate(SyntheticSequence(seed, style, 40)):
         tracks = tracker.track(frame.image)
         if last is not None:
-            before, after = common(last, tracks)
+            before, after = common_pixels(last, tracks)
             flows.append(np.linalg.norm(after - before, axis=1).mean())
-            lives += [index - born[track] for track in np.setdiff1d(last.ids, tracks.ids)]
+            lifetimes += [index - born[track] for track in np.setdiff1d(last.ids, tracks.ids)]
         born.update((track, born.get(track, index)) for track in tracks.ids)
         last = tracks
-    return float(np.mean(flows)), float(np.mean(lives))
+    return float(np.mean(flows)), float(np.mean(lifetimes))

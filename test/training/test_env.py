@@ -21,18 +21,15 @@ from kfvo_ros.errors import KfvoError
 from kfvo_ros.keyframes.base import KeyframePolicy
 from kfvo_ros.keyframes.guard import KeyframeGuard
 from kfvo_ros.keyframes.heuristics import EveryFrame
-from kfvo_ros.odometry import factory
 from kfvo_ros.odometry.keyframe_odometry import KeyframeOdometry
-from kfvo_ros.odometry.options import OdometryOptions
 from kfvo_ros.sequences.synthetic.sequence import SyntheticSequence
 from kfvo_ros.training.encoded_sequence import EncodedSequence, encode_sequence
 from kfvo_ros.training.env import OBSERVATION, PRIVILEGED, KeyframeEnvironment
-from kfvo_ros.training.episode import PRIVILEGED_SIZE, Episode
-from kfvo_ros.training.evaluation import Validation
+from kfvo_ros.training.episode import PRIVILEGED_SIZE, Episode, _metres_per_unit
 from kfvo_ros.training.rewards import PaperReward, Reward
 
 FRAMES = 30
-NO_RAIL = KeyframeGuard(min_survival=0.0, max_gap=10 ** 6, min_flow=0.0)
+NO_GUARD = KeyframeGuard(min_survival=0.0, max_gap=10 ** 6, min_flow=0.0)
 SIZE = 48 + 7 * 7 + 8
 ALL = np.arange(SIZE)
 
@@ -43,20 +40,24 @@ def backbone() -> GeometricBackbone:
 
 
 @pytest.fixture(scope='module')
-def drives(backbone) -> list[EncodedSequence]:
-    return [encode_sequence(SyntheticSequence(seed, 'smooth', FRAMES), backbone) for seed in (3, 4)]
+def sequences(backbone) -> list[EncodedSequence]:
+    return [encode_sequence(SyntheticSequence(seed, 'smooth', FRAMES), backbone)
+            for seed in (3, 4)]
 
 
-def begin(drive: EncodedSequence, backbone: GeometricBackbone, rail: KeyframeGuard = NO_RAIL) -> Episode:
-    return Episode(drive, backbone, 'depth', 8, rail, PaperReward())
+def make_episode(sequence: EncodedSequence, backbone: GeometricBackbone,
+                 guard: KeyframeGuard = NO_GUARD) -> Episode:
+    return Episode(sequence, backbone, 'depth', 8, guard, PaperReward())
 
 
-def again(drive: EncodedSequence, backbone: GeometricBackbone, rail: KeyframeGuard = NO_RAIL) -> Iterator[Episode]:
-    return (begin(drive, backbone, rail) for _ in repeat(None))
+def episodes(sequence: EncodedSequence, backbone: GeometricBackbone,
+             guard: KeyframeGuard = NO_GUARD) -> Iterator[Episode]:
+    """Yield the same episode without end."""
+    return (make_episode(sequence, backbone, guard) for _ in repeat(None))
 
 
-class Counting(GeometricBackbone):
-    """Counts its calls, and the windows in them."""
+class CountingBackbone(GeometricBackbone):
+    """Records the number of windows of each call."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -67,47 +68,47 @@ class Counting(GeometricBackbone):
         return super().estimate(windows)
 
 
-class Scripted(KeyframePolicy):
-    """Decides as it is told, and remembers what it saw."""
+class ScriptedPolicy(KeyframePolicy):
+    """Decides by a list, and records the observations."""
 
     name = 'scripted'
 
-    def __init__(self, answers) -> None:
-        self.answers, self.seen = iter(answers), []
+    def __init__(self, decisions) -> None:
+        self.decisions, self.observations = iter(decisions), []
 
     def decide(self, decision):
-        self.seen.append(decision.observation)
-        return next(self.answers)
+        self.observations.append(decision.observation)
+        return next(self.decisions)
 
 
-def test_an_environment_sees_what_a_running_policy_sees(backbone, drives):
-    answers = np.random.default_rng(0).integers(0, 2, FRAMES).astype(bool)
-    policy = Scripted(answers)
+def test_observations_are_those_of_a_policy_in_use(backbone, sequences):
+    decisions = np.random.default_rng(0).integers(0, 2, FRAMES).astype(bool)
+    policy = ScriptedPolicy(decisions)
     odometry = KeyframeOdometry(backbone, policy, 'depth')
     updates = [odometry.process(frame) for frame in SyntheticSequence(3, 'smooth', FRAMES)]
     assert all(update.status is not Status.LOST for update in updates)
 
-    environment = KeyframeEnvironment(backbone, [again(drives[0], backbone)], ALL)
+    environment = KeyframeEnvironment(backbone, [episodes(sequences[0], backbone)], ALL)
     seen = [environment.reset()[OBSERVATION][0]]
     for number in range(FRAMES - 8):
-        observations, _, dones, _ = environment.step(answers[number:number + 1])
+        observations, _, dones, _ = environment.step(decisions[number:number + 1])
         assert not dones[0]
         seen.append(observations[OBSERVATION][0])
-    np.testing.assert_array_equal(seen, policy.seen)
+    np.testing.assert_array_equal(seen, policy.observations)
 
 
-def test_what_is_hidden_is_not_there(backbone, drives):
-    source = again(drives[0], backbone)
+def test_observations_hold_the_selected_numbers_only(backbone, sequences):
+    source = episodes(sequences[0], backbone)
     everything = KeyframeEnvironment(backbone, [source], ALL).reset()[OBSERVATION][0]
     environment = KeyframeEnvironment(backbone, [source], ALL[48:])
     assert environment.observation_space[OBSERVATION].shape == (SIZE - 48,)
     np.testing.assert_array_equal(environment.reset()[OBSERVATION][0], everything[48:])
 
 
-def test_two_sequences_take_one_call_per_step(drives):
-    backbone = Counting()
+def test_two_sequences_take_one_call_per_step(sequences):
+    backbone = CountingBackbone()
     environment = KeyframeEnvironment(
-        backbone, [again(drive, backbone) for drive in drives], ALL)
+        backbone, [episodes(sequence, backbone) for sequence in sequences], ALL)
     environment.reset()
     backbone.calls.clear()
     for _ in range(5):
@@ -117,8 +118,8 @@ def test_two_sequences_take_one_call_per_step(drives):
     assert backbone.calls == [2] * 5
 
 
-def test_the_end_begins_the_next_episode_and_tells_the_last_observation(backbone, drives):
-    environment = KeyframeEnvironment(backbone, [again(drives[0], backbone)], ALL)
+def test_the_next_episode_follows_and_the_last_observation_is_terminal(backbone, sequences):
+    environment = KeyframeEnvironment(backbone, [episodes(sequences[0], backbone)], ALL)
     first = environment.reset()[OBSERVATION][0]
     decisions = FRAMES - 7
     for _ in range(decisions - 1):
@@ -131,13 +132,13 @@ def test_the_end_begins_the_next_episode_and_tells_the_last_observation(backbone
                                   last[OBSERVATION][0])
 
 
-def test_the_critic_is_told_true_motions_in_the_trajectory_s_unit(backbone, drives):
-    environment = KeyframeEnvironment(backbone, [again(drives[0], backbone)], ALL)
-    told = environment.reset()[PRIVILEGED][0]
-    truth = drives[0].T_truth_camera
+def test_privileged_observations_are_true_motions_in_trajectory_units(backbone, sequences):
+    environment = KeyframeEnvironment(backbone, [episodes(sequences[0], backbone)], ALL)
+    privileged = environment.reset()[PRIVILEGED][0]
+    truth = sequences[0].T_truth_camera
     true_motions = [geometry.relative(truth[7], truth[6]), geometry.relative(truth[7], truth[8]),
                     geometry.relative(truth[8], truth[9])]
-    motions = [geometry.transform_from_xyz_quat(told[at:at + 7].astype(float))
+    motions = [geometry.transform_from_xyz_quat(privileged[at:at + 7].astype(float))
                for at in (0, 7, 14)]
     scales = [np.linalg.norm(true[:3, 3]) / np.linalg.norm(motion[:3, 3])
               for true, motion in zip(true_motions, motions)]
@@ -150,39 +151,47 @@ def test_the_critic_is_told_true_motions_in_the_trajectory_s_unit(backbone, driv
     assert scales[0] == pytest.approx(expected, rel=0.01)
     for true, motion in zip(true_motions, motions):
         np.testing.assert_allclose(motion[:3, :3], true[:3, :3], atol=1e-6)
-    assert told[21] == told[22] == 0.0
+    assert privileged[21] == privileged[22] == 0.0
     for _ in range(FRAMES - 8):
         observations, *_ = environment.step(np.array([0]))
     end = observations[PRIVILEGED][0]
     assert end[21] == 1.0 and not end[7:21].any() and end[:7].any()
 
 
-def test_where_the_rail_decides_nobody_is_asked(backbone, drives):
-    always = KeyframeGuard(min_survival=0.0, max_gap=3, min_flow=0.0)
-    environment = KeyframeEnvironment(backbone, [again(drives[0], backbone, always)], ALL)
+@pytest.mark.parametrize(('spread_m', 'expected'), [(0.0099, 1.0), (0.0101, 0.0404)])
+def test_below_a_spread_of_1_cm_a_unit_counts_as_a_metre(spread_m, expected):
+    positions = np.outer([-0.5, 0.5], [0.6, 0.0, 0.8]) * np.sqrt(2.0)  # with a spread of 1
+    true = spread_m * positions
+    assert _metres_per_unit(0.25 * positions, true) == pytest.approx(expected)
+    assert _metres_per_unit(np.zeros((2, 3)), true) == 1.0
+
+
+def test_forced_decisions_are_not_steps(backbone, sequences):
+    guard = KeyframeGuard(min_survival=0.0, max_gap=3, min_flow=0.0)
+    environment = KeyframeEnvironment(backbone, [episodes(sequences[0], backbone, guard)], ALL)
     environment.reset()
-    asked = 1
+    steps = 1
     while True:
         _, _, dones, _ = environment.step(np.array([0]))
         if dones[0]:
             break
-        asked += 1
-    # Of three frames in a row the policy drops two, and the rail keeps the third.
-    assert asked == pytest.approx((FRAMES - 7) * 2 / 3, abs=1.0)
+        steps += 1
+    # Of three frames in a row the policy drops two, and the guard keeps the third.
+    assert steps == pytest.approx((FRAMES - 7) * 2 / 3, abs=1.0)
 
 
-def test_lost_and_unanswered_episodes_never_reach_the_rollout(backbone, drives):
-    short = EncodedSequence('short', drives[0].frames[:5], drives[0].encoded[:5],
-                            drives[0].T_truth_camera[:5])
-    sources = iter([begin(short, backbone), begin(short, backbone), begin(drives[1], backbone)])
-    environment = KeyframeEnvironment(backbone, [sources], ALL)
+def test_episodes_without_a_decision_are_skipped(backbone, sequences):
+    short = EncodedSequence('short', sequences[0].frames[:5], sequences[0].encoded[:5],
+                            sequences[0].T_truth_camera[:5])
+    source = (make_episode(each, backbone) for each in (short, short, sequences[1]))
+    environment = KeyframeEnvironment(backbone, [source], ALL)
     seen = environment.reset()[OBSERVATION][0]
-    alone = KeyframeEnvironment(backbone, [again(drives[1], backbone)], ALL)
+    alone = KeyframeEnvironment(backbone, [episodes(sequences[1], backbone)], ALL)
     np.testing.assert_array_equal(seen, alone.reset()[OBSERVATION][0])
 
 
-def test_a_lost_camera_ends_the_episode_and_its_frame_is_not_learned_from(drives):
-    class Losing(GeometricBackbone):
+def test_a_lost_camera_ends_the_episode_without_a_decision(sequences):
+    class LosingBackbone(GeometricBackbone):
         """Loses the camera in its eleventh window."""
 
         windows = 0
@@ -192,106 +201,99 @@ def test_a_lost_camera_ends_the_episode_and_its_frame_is_not_learned_from(drives
             return [replace(found, status=Status.LOST) if self.windows == 11 else found
                     for found in super().estimate(windows)]
 
-    losing = Losing()
-    environment = KeyframeEnvironment(losing, [again(drives[0], losing)], ALL)
+    losing = LosingBackbone()
+    environment = KeyframeEnvironment(losing, [episodes(sequences[0], losing)], ALL)
     seen = [environment.reset()[OBSERVATION][0]]
     ended = []
     for _ in range(6):
         observations, _, dones, infos = environment.step(np.array([1]))
         seen.append(observations[OBSERVATION][0])
         ended.append(bool(dones[0]))
-    # Frames 7 to 10 are decided on; the next one is lost, and the sequence begins again.
+    # Frames 7 to 10 are decisions; the next frame is lost, and the sequence starts again.
     assert ended == [False, False, False, True, False, False]
     np.testing.assert_array_equal(seen[4], seen[0])
     assert infos == [{}]
 
 
-def test_nothing_is_earned_before_the_first_question(backbone, drives):
-    class One(Reward):
+def test_rewards_before_the_first_decision_do_not_count(backbone, sequences):
+    class ConstantReward(Reward):
         def __call__(self, T_world_frame, T_truth_frame, keep):
             return 1.0
 
-    # The gap of any frame is one: until the window is full nobody is asked, then by the rail.
+    # The gap of any frame is one: with a full window every decision is forced.
     forcing = KeyframeGuard(min_survival=0.0, max_gap=1, min_flow=0.0)
-    episode = Episode(drives[0], backbone, 'depth', 8, forcing, One())
-    other = Episode(drives[0], backbone, 'depth', 8, NO_RAIL, One())
-    for each in (episode, other):
+    forced = Episode(sequences[0], backbone, 'depth', 8, forcing, ConstantReward())
+    free = Episode(sequences[0], backbone, 'depth', 8, NO_GUARD, ConstantReward())
+    for each in (forced, free):
         while not each.ended and each.decision is None:
-            window = each.enter()
-            each.leave(backbone.estimate([window])[0] if window is not None else None)
-    assert episode.ended and not episode.asked and episode.take_reward() == 0.0
-    other.decide(True)
-    assert other.asked and other.take_reward() == 1.0
+            window = each.begin()
+            each.integrate(backbone.estimate([window])[0] if window is not None else None)
+    assert forced.ended and not forced.reached_decision and forced.pop_reward() == 0.0
+    free.decide(True)
+    assert free.reached_decision and free.pop_reward() == 1.0 and free.pop_reward() == 0.0
 
 
-def test_frames_not_seen_before_are_encoded_in_one_call(backbone, drives):
-    class Seeing(Counting):
+def test_frames_of_many_sequences_are_encoded_in_one_call(backbone, sequences):
+    class EncodingBackbone(CountingBackbone):
         def encode(self, seen):
             self.calls.append(-len(seen))
             return super().encode(seen)
 
-    seeing = Seeing()
-    live = [encode_sequence(SyntheticSequence(seed, 'smooth', FRAMES), None) for seed in (3, 4)]
-    environment = KeyframeEnvironment(seeing, [again(drive, seeing) for drive in live], ALL)
-    known = KeyframeEnvironment(backbone, [again(drive, backbone) for drive in drives], ALL)
-    for each in (environment, known):
+    encoding = EncodingBackbone()
+    images = [encode_sequence(SyntheticSequence(seed, 'smooth', FRAMES), None) for seed in (3, 4)]
+    environment = KeyframeEnvironment(encoding, [episodes(each, encoding) for each in images], ALL)
+    encoded = KeyframeEnvironment(backbone, [episodes(each, backbone) for each in sequences], ALL)
+    for each in (environment, encoded):
         each.reset()
-    seeing.calls.clear()
+    encoding.calls.clear()
     for _ in range(5):
-        seen, recorded = (each.step(np.array([1, 0])) for each in (environment, known))
-        np.testing.assert_array_equal(seen[0][OBSERVATION], recorded[0][OBSERVATION])
-    assert seeing.calls == [-2, 2] * 5
+        found, expected = (each.step(np.array([1, 0])) for each in (environment, encoded))
+        np.testing.assert_array_equal(found[0][OBSERVATION], expected[0][OBSERVATION])
+    assert encoding.calls == [-2, 2] * 5
 
 
-def test_a_reward_may_ask_for_a_stretch_of_the_trajectory(backbone, drives):
-    class Looking(Reward):
+def test_a_reward_with_a_span_gets_the_latest_frames(backbone, sequences):
+    class RecordingReward(Reward):
         span = 10
 
         def __init__(self) -> None:
-            self.told = []
+            self.calls = []
 
         def __call__(self, T_world_frame, T_truth_frame, keep):
-            self.told.append((T_world_frame, T_truth_frame))
-            self.standing = 0.5 * len(self.told)
+            self.calls.append((T_world_frame, T_truth_frame))
+            self.quality = 0.5 * len(self.calls)
             return 1.0
 
-    looking = Looking()
-    episode = Episode(drives[0], backbone, 'depth', 8, NO_RAIL, looking)
+    reward = RecordingReward()
+    episode = Episode(sequences[0], backbone, 'depth', 8, NO_GUARD, reward)
     environment = KeyframeEnvironment(backbone, [iter([episode])], ALL)
     environment.reset()
     for number in range(FRAMES - 8):
         observations, *_ = environment.step(np.array([number % 2]))
-    assert observations[PRIVILEGED][0, -1] == looking.standing == 0.5 * (FRAMES - 8)
-    estimated, true = looking.told[-1]
-    np.testing.assert_array_equal(true, drives[0].T_truth_camera[-11:-1])
+    assert observations[PRIVILEGED][0, -1] == reward.quality == 0.5 * (FRAMES - 8)
+    estimated, true = reward.calls[-1]
+    np.testing.assert_array_equal(true, sequences[0].T_truth_camera[-11:-1])
     aligned = geometry.umeyama(estimated[:, :3, 3], true[:, :3, 3])
     path = np.linalg.norm(np.diff(true[:, :3, 3], axis=0), axis=1).sum()
     assert np.abs(aligned.transform_points(estimated[:, :3, 3]) - true[:, :3, 3]).max() \
         < 0.02 * path
-    assert len(looking.told[0][0]) == 8
+    assert len(reward.calls[0][0]) == 8
 
 
 def test_a_sequence_without_truth_of_the_camera_is_refused(backbone):
-    class Blind(SyntheticSequence):
+    class WithoutTruth(SyntheticSequence):
         def ground_truth(self):
             return None
 
     with pytest.raises(KfvoError, match='expected ground truth of the camera'):
-        encode_sequence(Blind(3, 'smooth', 3), backbone)
+        encode_sequence(WithoutTruth(3, 'smooth', 3), backbone)
 
 
-def test_a_drive_that_never_moves_is_named(backbone, drives):
-    still = EncodedSequence('still', drives[0].frames, drives[0].encoded, np.tile(np.eye(4), (FRAMES, 1, 1)))
-    validation = Validation([still], backbone, factory.signature_of(OdometryOptions(), backbone))
-    with pytest.raises(KfvoError, match='^still: the ground truth never moves'):
-        validation.score(EveryFrame())
-
-
-def test_stable_baselines_learns_in_it(drives):
+def test_stable_baselines_learns_in_it(sequences):
     from stable_baselines3 import PPO
     backbone = GeometricBackbone()
     environment = KeyframeEnvironment(
-        backbone, [again(drive, backbone) for drive in drives], ALL)
+        backbone, [episodes(sequence, backbone) for sequence in sequences], ALL)
     model = PPO('MultiInputPolicy', environment, n_steps=16, batch_size=16, n_epochs=1, seed=0,
                 device='cpu')
     before = model.policy.action_net.weight.detach().clone()

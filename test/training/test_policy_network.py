@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The trained networks: what each may see, and that the exported actor is the trained one."""
+"""The networks of actor and critic, and the export of the actor."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def observations(count: int) -> dict[str, torch.Tensor]:
             PRIVILEGED: torch.randn(count, PRIVILEGED_SIZE, requires_grad=True)}
 
 
-def test_the_actor_never_sees_what_is_privileged(policy):
+def test_the_actor_does_not_see_privileged_input(policy):
     seen = observations(16)
     policy.get_distribution(seen).distribution.logits.abs().sum().backward()
     assert seen[OBSERVATION].grad.abs().sum() > 0.0
@@ -52,7 +52,7 @@ def test_the_critic_sees_both(policy):
     assert all(seen[name].grad.abs().sum() > 0.0 for name in (OBSERVATION, PRIVILEGED))
 
 
-def test_actor_and_critic_share_nothing(policy):
+def test_actor_and_critic_share_no_parameters(policy):
     actor = {id(each) for part in (policy.mlp_extractor.actor, policy.action_net)
              for each in part.parameters()}
     critic = {id(each) for part in (policy.mlp_extractor.critic, policy.value_net)
@@ -80,3 +80,22 @@ def test_the_exported_actor_is_the_trained_one(policy):
     found = preferences / preferences.sum(axis=1, keepdims=True)
     assert np.abs(found - expected).max() < 1e-6
     assert 100 < (found[:, 1] > 0.5).sum() < 900
+
+
+def test_the_exported_actor_adds_epsilon_to_the_variance(policy):
+    """An input that never varied in training has variance 0 and is divided by epsilon's root."""
+    statistics = RunningMeanStd(shape=(SIZE,))
+    statistics.mean, statistics.var = np.full(SIZE, 3.0), np.full(SIZE, 0.05)
+    statistics.var[::2] = 0.0
+    actor = export_actor(policy, statistics, 0.04)
+    np.testing.assert_allclose(actor.std[:2], [0.2, 0.3], rtol=1e-12)
+    standard = np.random.default_rng(1).uniform(-2.0, 2.0, (50, SIZE)).astype(np.float32)
+    raw = 3.0 + standard * np.tile([0.2, 0.3], SIZE)[:SIZE]
+    with torch.no_grad():
+        expected = policy.get_distribution({
+            OBSERVATION: torch.tensor(standard),
+            PRIVILEGED: torch.zeros(50, PRIVILEGED_SIZE)}).distribution.logits.numpy()
+    found = actor.logits(raw)
+    # torch normalises its logits; their difference is the same.
+    np.testing.assert_allclose(found[:, 1] - found[:, 0], expected[:, 1] - expected[:, 0],
+                               atol=1e-5)

@@ -116,9 +116,9 @@ def test_vggt_learns_with_the_rail_that_it_can_have(small_vggt, tmp_path, monkey
         '--environments', '2', *vggt, '--output', 'policy.safetensors']) == 0
     assert 'learned, 16 steps' in capsys.readouterr().out
     policy = read_policy(Path('policy.safetensors'))
-    assert policy.rail == KeyframeGuard(0.0, 5, 0.0) and not policy.rail.needs_tracks
-    assert (policy.setting.backbone, policy.setting.scale_rule) == ('vggt', 'none')
-    assert [name for name, _ in policy.setting.observation] == ['descriptor', 'poses']
+    assert policy.guard == KeyframeGuard(0.0, 5, 0.0) and not policy.guard.needs_tracks
+    assert (policy.signature.backbone, policy.signature.scale_rule) == ('vggt', 'none')
+    assert [name for name, _ in policy.signature.observation] == ['descriptor', 'poses']
     assert run.main(['synthetic:5', '--keyframes', 'learned', '--policy', 'policy.safetensors',
                      '--scale', 'none', '--output', 'out', *vggt]) == 0
     assert policy.training['vggt']['weights'] == str(small_vggt)

@@ -83,10 +83,10 @@ def test_a_drive_comes_back_from_its_file_as_it_was(backbone, tmp_path):
         for a, b in ((ours.tracks, theirs.tracks), (ours.payload.tracks, theirs.payload.tracks)):
             np.testing.assert_array_equal(a.ids, b.ids)
             np.testing.assert_array_equal(a.pixels, b.pixels)
-            np.testing.assert_array_equal(a.doubts, b.doubts)
+            np.testing.assert_array_equal(a.uncertainty, b.uncertainty)
         np.testing.assert_array_equal(ours.payload.points, theirs.payload.points)
     assert back.frames[0].camera == drive.frames[0].camera
-    assert drive.encoded[-1].tracks.doubts.any()
+    assert drive.encoded[-1].tracks.uncertainty.any()
 
 
 @pytest.mark.parametrize('damage', [b'', b'nonsense', b'\x00' * 100])

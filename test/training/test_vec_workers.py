@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Environments in processes of their own: what ends them, and what does not."""
+"""Environments in worker processes: signals, errors and their end."""
 
 from __future__ import annotations
 
@@ -20,30 +20,30 @@ from gymnasium import spaces
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.training.env import OBSERVATION, EpisodeVecEnv
 from kfvo_ros.training.vec_workers import STEP, VecWorkers, _serve
-from kfvo_ros.utils.process import SIGNALS, Interrupted
+from kfvo_ros.utils.signals import SIGNALS, Interrupted
 
-SEEN = {OBSERVATION: np.zeros((1, 2), np.float32)}
+OBSERVATIONS = {OBSERVATION: np.zeros((1, 2), np.float32)}
 
 
-class Still(EpisodeVecEnv):
-    """One episode in which nothing happens."""
+class StaticEnvironment(EpisodeVecEnv):
+    """One episode with constant observations."""
 
     def __init__(self) -> None:
         super().__init__(1, spaces.Dict({OBSERVATION: spaces.Box(-1.0, 1.0, (2,))}),
                          spaces.Discrete(2))
 
     def reset(self):
-        return SEEN
+        return OBSERVATIONS
 
     def step_async(self, actions):
         pass
 
     def step_wait(self):
-        return SEEN, np.zeros(1, np.float32), np.zeros(1, bool), [{}]
+        return OBSERVATIONS, np.zeros(1, np.float32), np.zeros(1, bool), [{}]
 
 
-class Disturbed:
-    """Makes such an environment; Ctrl-C comes as early as it arrives in the process."""
+class InterruptedMaker:
+    """Makes a StaticEnvironment; signals arrive while the worker unpickles this."""
 
     def __setstate__(self, state) -> None:
         for number in SIGNALS:
@@ -52,17 +52,17 @@ class Disturbed:
     def __getstate__(self):
         return {'not': 'empty'}
 
-    def __call__(self) -> Still:
-        return Still()
+    def __call__(self) -> StaticEnvironment:
+        return StaticEnvironment()
 
 
-def unable() -> Still:
+def failing_maker() -> StaticEnvironment:
     raise KfvoError('expected more, less came')
 
 
-def test_signals_to_all_processes_leave_workers_alone():
+def test_workers_ignore_signals_to_all_processes():
     resource_tracker._resource_tracker._stop()  # as in a process that begins
-    environment = VecWorkers([Disturbed(), Disturbed()])
+    environment = VecWorkers([InterruptedMaker(), InterruptedMaker()])
     try:
         environment.reset()
         for number in SIGNALS:
@@ -78,11 +78,11 @@ def test_signals_to_all_processes_leave_workers_alone():
         assert not process.is_alive()
 
 
-def test_a_worker_that_is_gone_is_one_clear_line():
-    environment = VecWorkers([Still, Still])
+def test_a_worker_that_ended_is_one_clear_line():
+    environment = VecWorkers([StaticEnvironment, StaticEnvironment])
     last = environment._processes[-1]
     try:
-        os.kill(last.pid, signal.SIGSTOP)  # what comes stays unread
+        os.kill(last.pid, signal.SIGSTOP)  # messages stay unread
         environment.step_async(np.zeros(2, np.int64))
         last.kill()
         with pytest.raises(KfvoError, match='^a worker process ended; is there memory for fewer'):
@@ -94,19 +94,19 @@ def test_a_worker_that_is_gone_is_one_clear_line():
         environment.close()
 
 
-def test_where_one_cannot_begin_all_end():
+def test_if_one_worker_fails_to_start_all_end():
     with pytest.raises(KfvoError) as refusal:
-        VecWorkers([Still, unable])
+        VecWorkers([StaticEnvironment, failing_maker])
     for process in multiprocessing.active_children():
         process.join(10.0)
         assert not process.is_alive()
-    assert str(refusal.value) == 'expected more, less came'  # which holds all that was begun
+    assert str(refusal.value) == 'expected more, less came'  # its traceback holds the workers
 
 
-def test_none_is_left_by_an_impatient_signal(monkeypatch):
-    environment = VecWorkers([Still])
+def test_a_signal_while_closing_leaves_no_worker(monkeypatch):
+    environment = VecWorkers([StaticEnvironment])
     process, = environment._processes
-    os.kill(process.pid, signal.SIGSTOP)  # as one at a long sequence
+    os.kill(process.pid, signal.SIGSTOP)  # as in the middle of a long sequence
 
     def interrupt(timeout: float) -> None:
         raise Interrupted
@@ -121,14 +121,14 @@ def test_none_is_left_by_an_impatient_signal(monkeypatch):
         process.kill()
 
 
-def test_a_worker_that_nobody_waits_for_ends_quietly():
+def test_a_worker_ends_quietly_with_its_pipe():
     ours, theirs = multiprocessing.Pipe()
 
-    class Orphaned(Still):
+    class ClosingEnvironment(StaticEnvironment):
         def step_wait(self):
             ours.close()
             return super().step_wait()
 
     ours.send((STEP, np.zeros(1)))
-    _serve(theirs, Orphaned)
+    _serve(theirs, ClosingEnvironment)
     assert ours.closed

@@ -101,7 +101,7 @@ def test_play_options():
 
 
 @pytest.mark.parametrize(('arguments', 'complaint'), [
-    (['--clock', 'walk.bag'], "invalid float value: 'walk.bag'; without a value"),
+    (['--clock', 'walk.bag'], "came 'walk.bag'; without a value"),
     (['--wait-for-subscribers', '0'], 'at least 1'),
     (['--start', '-1'], 'at least 0'),
     (['--duration', 'nan'], 'nan'),

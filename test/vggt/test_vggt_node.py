@@ -21,13 +21,13 @@ from kfvo_ros.odometry.options import OdometryOptions, VggtOptions
 
 COUNT = 12
 SLACK = 4 << 20
-"""Memory for all but the model, whose matrices at this size do not fit into it [bytes]."""
+"""Memory beyond the model's own, too small for the activations at this image size [bytes]."""
 FRAMES = make_frames()[:COUNT]
 
 
 @pytest.fixture(scope='module')
-def drive(small_vggt) -> SimpleNamespace:
-    """Return what a node said of images without any calibration, and of smaller ones after."""
+def run(small_vggt) -> SimpleNamespace:
+    """Output of a node for images without calibration, then for smaller ones."""
     with Rig(backbone='vggt', weights=small_vggt, image_width=WIDTH, precision='fp32',
              device='cpu') as rig:
         rig.send(FRAMES, with_info=False)
@@ -44,26 +44,26 @@ def drive(small_vggt) -> SimpleNamespace:
                            code=rig.process.returncode)
 
 
-def test_poses_are_those_of_the_odometry_offline(drive, small_vggt):
+def test_poses_equal_those_of_the_odometry_offline(run, small_vggt):
     options = OdometryOptions(backbone='vggt')
     odometry = make_odometry(options, make_backbone(options, VggtOptions(
         weights=str(small_vggt), device='cpu', precision='fp32', image_width=WIDTH)))
-    assert [stamp_ns(message) for message in drive.messages] == [f.stamp_ns for f in FRAMES]
-    for message, frame in zip(drive.messages, FRAMES, strict=True):
+    assert [stamp_ns(message) for message in run.messages] == [f.stamp_ns for f in FRAMES]
+    for message, frame in zip(run.messages, FRAMES, strict=True):
         pose = odometry.process(frame).T_world_camera
         np.testing.assert_allclose(to_pose(message.pose.pose), base_pose(pose, T_BODY_OPTICAL),
                                    atol=1e-4)
-    assert np.abs(to_pose(drive.messages[-1].pose.pose) - np.eye(4)).max() > 0.01
+    assert np.abs(to_pose(run.messages[-1].pose.pose) - np.eye(4)).max() > 0.01
 
 
-def test_covariances_are_proper(drive):
-    for message in drive.messages:
+def test_covariances_are_positive_definite(run):
+    for message in run.messages:
         covariance = np.reshape(message.pose.covariance, (6, 6))
         assert np.linalg.eigvalsh(covariance)[0] > 0.0
 
 
-def test_diagnostics_show_device_precision_and_camera(drive):
-    level, summary, values = drive.state
+def test_diagnostics_show_device_precision_and_camera(run):
+    level, summary, values = run.state
     assert (level, summary) == (0, 'tracking')
     assert (values['backbone'], values['device'], values['precision']) == (
         'vggt', 'cpu', 'float32')
@@ -72,33 +72,34 @@ def test_diagnostics_show_device_precision_and_camera(drive):
     assert (values['images refused'], values['resets'], values['frames lost']) == ('0', '0', '0')
 
 
-def test_another_size_of_images_starts_anew(drive):
-    assert any('starting anew' in line and 'another size' in line for line in drive.lines)
-    assert len(drive.later) == 3
-    np.testing.assert_allclose(to_pose(drive.later[0].pose.pose), np.eye(4), atol=1e-12)
-    assert drive.code == 0
-    assert not [line for line in drive.lines if '[ERROR]' in line or 'Traceback' in line]
+def test_another_image_size_restarts(run):
+    assert any('restarting' in line and 'another size' in line for line in run.lines)
+    assert len(run.later) == 3
+    np.testing.assert_allclose(to_pose(run.later[0].pose.pose), np.eye(4), atol=1e-12)
+    assert run.code == 0
+    assert not [line for line in run.lines if '[ERROR]' in line or 'Traceback' in line]
 
 
 @needs_compiler
-def test_once_ready_no_frame_waits_for_the_compiler(drive, small_vggt, monkeypatch):
-    """Of compilations torch tells all but the first, which every kind of block follows."""
+def test_no_frame_waits_for_the_compiler(run, small_vggt, monkeypatch):
+    """torch logs all compilations but the first; every kind of block causes further ones."""
     monkeypatch.setitem(ENVIRONMENT, 'TORCH_LOGS', 'recompiles')
     with Rig(backbone='vggt', weights=small_vggt, image_width=WIDTH, precision='fp32',
-             device='cpu', compile=True, patience=120.0) as rig:
+             device='cpu', compile=True, timeout_s=120.0) as rig:
         rig.send(FRAMES, with_info=False)
         messages = rig.odometry(COUNT)
         rig.stop()
     ready = next(number for number, line in enumerate(rig.lines) if 'ready' in line)
     assert any('Recompiling' in line for line in rig.lines[:ready])
     assert not any('Recompiling' in line for line in rig.lines[ready:])
-    for message, right in zip(messages, drive.messages, strict=True):
-        np.testing.assert_allclose(to_pose(message.pose.pose), to_pose(right.pose.pose), atol=1e-4)
+    for message, expected in zip(messages, run.messages, strict=True):
+        np.testing.assert_allclose(to_pose(message.pose.pose), to_pose(expected.pose.pose),
+                                   atol=1e-4)
 
 
 @pytest.mark.skipif(sys.platform != 'linux', reason='only Linux lets us limit another process')
-def test_full_memory_is_told_once_and_survived(small_vggt):
-    """Images are refused while there is no memory; then all goes on."""
+def test_full_memory_is_reported_once_and_survived(small_vggt):
+    """Images are refused while memory is full; processing resumes afterwards."""
     with Rig(backbone='vggt', weights=small_vggt, image_width=1120, precision='fp32',
              device='cpu') as rig:
         def limit(size: int) -> None:
@@ -124,7 +125,7 @@ def test_full_memory_is_told_once_and_survived(small_vggt):
 @pytest.mark.parametrize(('parameters', 'parts'), [
     (['weights:=/no/such.safetensors'], ['no file of weights', '/no/such.safetensors']),
     (['precision:=fp8'], ['precision', "'fp8'"])])
-def test_what_cannot_be_ends_the_node_in_one_line(parameters, parts, small_vggt):
+def test_invalid_parameters_end_the_node_in_one_line(parameters, parts, small_vggt):
     arguments = ['backbone:=vggt', f'weights:={small_vggt}', *parameters]
     done = run_module(NODE, '--ros-args', *(word for each in arguments for word in ('-p', each)))
     assert done.returncode == 1 and 'Traceback' not in done.stderr

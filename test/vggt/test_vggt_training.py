@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Training steps many sequences with one forward of the trunk and one of the rest."""
+"""Training with VGGT: one encode and one estimate per step of all environments."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ ENVIRONMENTS, FRAMES = 20, 20
 
 
 @dataclass(frozen=True)
-class SmallLesson(EnvironmentConfig):
-    """A lesson with a small random model."""
+class SmallConfig(EnvironmentConfig):
+    """Environments with the small model."""
 
-    def backbone(self) -> Backbone:
+    def make_backbone(self) -> Backbone:
         return VggtBackbone(small_model(), WIDTH)
 
 
@@ -40,20 +40,20 @@ def test_twenty_sequences_take_one_encode_and_one_estimate_per_step(tmp_path):
                                  make_poses(FRAMES, number))[0] for number in range(ENVIRONMENTS)]
     calls: Counter[str] = Counter()
 
-    def counted(name):
+    def counter(name):
         return lambda module, inputs, output: calls.update([name])
 
-    lesson = SmallLesson(
+    config = SmallConfig(
         tuple(map(str, sequences)),
         SequenceOptions(stop=FRAMES), OdometryOptions(backbone='vggt', scale_rule='none'),
         augmentation=Augmentation(drop_share=0.0, max_stride=1, frames=FRAMES),
-        variants=1, reward='paper', rail=NO_GUARD)
-    environment = make_environment(lesson, ENVIRONMENTS, 1, 0)
+        variants=1, reward='paper', guard=NO_GUARD)
+    environment = make_environment(config, ENVIRONMENTS, 1, 0)
     observed = environment.reset()[OBSERVATION]
     assert len(np.unique(observed, axis=0)) == ENVIRONMENTS
     parts = {'encode': small_model().aggregator.patch_embed,
              'estimate': small_model().camera_head}
-    hooks = [part.register_forward_hook(counted(name)) for name, part in parts.items()]
+    hooks = [part.register_forward_hook(counter(name)) for name, part in parts.items()]
     try:
         rng = np.random.default_rng(0)
         for step in range(1, FRAMES - 8 + 1):

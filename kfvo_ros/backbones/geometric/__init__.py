@@ -1,3 +1,3 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The backbone for any CPU: KLT tracks and windowed bundle adjustment."""
+"""Geometric backbone for any CPU: KLT tracks and windowed bundle adjustment."""

@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The geometric backbone against the contract: encode by tracking, estimate by solving."""
+"""Geometric backbone: `encode` tracks features, `estimate` solves the window."""
 
 from __future__ import annotations
 
@@ -9,37 +9,26 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from kfvo_ros.backbones.base import Backbone, Encoded, Estimate, Status, Stream, Window, lost
-from kfvo_ros.backbones.geometric import bundle_adjustment as ba
-from kfvo_ros.backbones.geometric import reprojection, schur
+from kfvo_ros.backbones.base import (
+    Backbone,
+    Encoded,
+    Estimate,
+    Status,
+    Stream,
+    Window,
+    lost_estimate,
+)
 from kfvo_ros.backbones.geometric.initialisation import Initialiser
 from kfvo_ros.backbones.geometric.keyframe_history import (
     KeyframeHistory,
-    count_shared,
     history_of,
-    recall,
+    select_history,
 )
-from kfvo_ros.backbones.geometric.numba_utils import (
-    median,
-    median_where,
-    medians_of_nearest,
-)
-from kfvo_ros.backbones.geometric.observations import FrameTracks, build_track_table, merge_tracks
-from kfvo_ros.backbones.geometric.reprojection import Problem, State
+from kfvo_ros.backbones.geometric.numba_utils import compile_entry_points
+from kfvo_ros.backbones.geometric.observations import FrameTracks, build_track_table
 from kfvo_ros.backbones.geometric.rolling_shutter import RollingShutter
-from kfvo_ros.backbones.geometric.self_calibration import (
-    ASKED_AGAIN,
-    IntrinsicsFilter,
-    undistort_points,
-)
-from kfvo_ros.backbones.geometric.signals import (
-    SIGNAL_NAMES,
-    correlate,
-    measure_motion,
-    median_shifts,
-    signals,
-)
-from kfvo_ros.backbones.geometric.triangulation import point_positions, triangulate
+from kfvo_ros.backbones.geometric.self_calibration import MIN_NEW_SHARE, IntrinsicsFilter
+from kfvo_ros.backbones.geometric.signals import SIGNAL_NAMES, compute_signals, measure_motion
 from kfvo_ros.backbones.geometric.window import Solution, solve
 from kfvo_ros.camera import Camera
 from kfvo_ros.errors import KfvoError
@@ -49,12 +38,13 @@ from kfvo_ros.tracking import tracker
 from kfvo_ros.tracking.tracker import FEATURES, Tracker
 
 THUMBNAIL = (8, 6)
+"""Width and height of the descriptor."""
 MIN_TRACKS = 12
-"""The newest frame needs as many tracks in common with the window to be placed."""
+"""Least number of tracks, and of inliers, that the newest frame shares with the window."""
 
 
 class GeometricStream(Stream):
-    """Tracks of one sequence."""
+    """Feature tracks of one sequence."""
 
     def __init__(self, camera: Camera, seed: int, features: int) -> None:
         self.camera = camera
@@ -64,7 +54,7 @@ class GeometricStream(Stream):
         self._count = 0
 
     def encode(self, frame: Frame) -> Encoded:
-        """Track the frame; the descriptor is an 8x6 thumbnail free of brightness and contrast."""
+        """Track the frame; the descriptor is a thumbnail normalised in brightness and contrast."""
         grey = to_grey(frame.image)
         if grey.shape != (self.camera.height, self.camera.width):
             raise KfvoError(f'the calibration is for {self.camera.width}x{self.camera.height} '
@@ -72,15 +62,15 @@ class GeometricStream(Stream):
         tracks = self._tracker.track(grey)
         points = self.camera.undistort(self._shutter.correct(frame.stamp_ns, tracks))
         usable = np.isfinite(points).all(axis=1)
-        view = FrameTracks(self._count, tracks.select(usable), points[usable])
+        frame_tracks = FrameTracks(self._count, tracks.select(usable), points[usable])
         self._count += 1
-        return Encoded(frame.stamp_ns, _describe(grey), view, tracks)
+        return Encoded(frame.stamp_ns, _thumbnail(grey), frame_tracks, tracks)
 
 
 class GeometricBackbone(Backbone):
-    """Needs a calibrated camera; poses come with points, so scale is aligned by depth.
+    """Monocular backbone for calibrated cameras; tracks up to `features` corners per frame.
 
-    It follows up to so many `features` per frame.
+    Estimates have points, so scale is aligned by depth.
     """
 
     name = 'geometric'
@@ -92,7 +82,7 @@ class GeometricBackbone(Backbone):
 
     def __init__(self, seed: int = 0, features: int = FEATURES) -> None:
         self._seed, self._features = seed, features
-        compile_kernels()
+        compile_entry_points()  # No frame waits for the compiler.
 
     def open(self, camera: Camera | None) -> GeometricStream:
         """Start a sequence; raises KfvoError without a calibration."""
@@ -113,71 +103,55 @@ def _stream_of(window: Window) -> GeometricStream:
 
 
 def _estimate(window: Window, stream: GeometricStream) -> Estimate:
-    views = tuple(encoded.payload for encoded in window.frames)
-    previous = window.previous
-    memory = history_of(previous)
-    history = recall(memory, 1.0 if previous is None else previous.memory_scale, views[0])
-    observations = build_track_table(history.views + views, len(history.views), memory.lens)
-    if observations.mask[:, -1].sum() < MIN_TRACKS:
-        return lost(window, len(SIGNAL_NAMES), KeyframeHistory())
-    solution = solve(observations, stream.initialiser, previous, history)
+    """Return the estimate of one window, LOST where the newest frame shares too few tracks."""
+    frames: tuple[FrameTracks, ...] = tuple(encoded.payload for encoded in window.frames)
+    prior = window.prior
+    memory = history_of(prior)
+    history = select_history(memory, 1.0 if prior is None else prior.memory_scale, frames[0])
+    table = build_track_table(history.frames + frames, len(history.frames),
+                              memory.intrinsics_filter)
+    if table.mask[:, -1].sum() < MIN_TRACKS:
+        return lost_estimate(window, len(SIGNAL_NAMES), KeyframeHistory())
+    solution = solve(table, stream.initialiser, prior, history)
     poses = solution.T_anchor_frame
     if solution.problem.mask[-1].sum() < MIN_TRACKS or not np.isfinite(poses).all():
-        return lost(window, len(SIGNAL_NAMES), KeyframeHistory())
-    motion = measure_motion(solution, views[-2], views[-1], stream.initialiser.focal)
-    lens = _update_intrinsics(memory, solution, views, stream.camera)
-    return Estimate(poses[solution.anchor:], solution.covariance, solution.points,
-                    signals(solution, motion),
-                    Status.HELD if motion.held else Status.OK,
-                    KeyframeHistory(history.views + views, poses, solution.median_depth,
-                                    measured=memory.measured or solution.measured,
-                                    unmeasured=memory.unmeasured if solution.measured else views[-1].index,
-                                    windows=memory.windows + 1, lens=lens,
-                                    trusted=_trusted_points(memory, solution)),
-                    lens.intrinsics(stream.camera) if lens.known else None)
+        return lost_estimate(window, len(SIGNAL_NAMES), KeyframeHistory())
+    motion = measure_motion(solution, frames[-2], frames[-1], stream.initialiser.focal)
+    intrinsics_filter = _update_intrinsics(memory, solution, frames, stream.camera)
+    return Estimate(
+        poses[solution.anchor:], solution.covariance, solution.points,
+        compute_signals(solution, motion), Status.HELD if motion.held else Status.OK,
+        _next_memory(memory, history.frames + frames, solution, intrinsics_filter),
+        intrinsics_filter.intrinsics(stream.camera) if intrinsics_filter.converged else None)
 
 
-def _trusted_points(memory: KeyframeHistory, solution: Solution) -> np.ndarray:
-    """Return the ids of those points whose depths are measured well, or once were."""
+def _next_memory(memory: KeyframeHistory, frames: tuple[FrameTracks, ...], solution: Solution,
+                 intrinsics_filter: IntrinsicsFilter) -> KeyframeHistory:
+    """Return the memory after a solved window; a point once measured well stays trusted."""
     ids = solution.points.ids
-    return ids[solution.well_known | tracker.present(ids, memory.trusted)]
+    trusted = solution.well_measured | tracker.ids_in(ids, memory.trusted_ids)
+    return KeyframeHistory(
+        frames, solution.T_anchor_frame, solution.median_depth,
+        measured=memory.measured or solution.measured,
+        last_unmeasured=memory.last_unmeasured if solution.measured else frames[-1].index,
+        windows=memory.windows + 1, intrinsics_filter=intrinsics_filter,
+        trusted_ids=ids[trusted])
 
 
-def _update_intrinsics(memory: KeyframeHistory, solution: Solution, views: tuple[FrameTracks, ...], camera: Camera) -> IntrinsicsFilter:
-    """Ask the window of the lens, once enough of its frames are new.
+def _update_intrinsics(memory: KeyframeHistory, solution: Solution,
+                       frames: tuple[FrameTracks, ...], camera: Camera) -> IntrinsicsFilter:
+    """Return the filter after this window, unchanged while too few of its frames are new.
 
-    What a rolling shutter leaves in the tracks would be laid to the lens.
+    It is not used with a rolling shutter, whose residual effect it would absorb.
     """
-    lens, indices = memory.lens, [view.index for view in views]
-    if not (memory.certain and solution.measured and camera.readout_s == 0.0
-            and lens.new_in(indices) >= ASKED_AGAIN):
-        return lens
-    return lens.told(solution.problem, solution.state, solution.noise, indices)
+    intrinsics_filter, indices = memory.intrinsics_filter, [frame.index for frame in frames]
+    if not (memory.initialised and solution.measured and camera.readout_s == 0.0
+            and intrinsics_filter.new_share(indices) >= MIN_NEW_SHARE):
+        return intrinsics_filter
+    return intrinsics_filter.update(solution.problem, solution.state, solution.noise, indices)
 
 
-def _describe(grey: np.ndarray) -> np.ndarray:
+def _thumbnail(grey: np.ndarray) -> np.ndarray:
+    """Return the descriptor (48,) float32 of zero mean and about unit deviation."""
     small = cv2.resize(grey, THUMBNAIL, interpolation=cv2.INTER_AREA).astype(np.float32).ravel()
     return (small - small.mean()) / (small.std() + 5.0)
-
-
-def compile_kernels() -> None:
-    """Compile everything, or load it from the cache, before a frame would wait for it."""
-    rotations, translations, ones = np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3)), np.ones(1)
-    points = undistort_points(np.zeros((2, 2)), np.zeros(ba.LENS))
-    ids, seen, mask, hosts, _ = merge_tracks(np.zeros(2, dtype=np.int64), points, np.zeros(2),
-                                             np.array([1, 2]), 1)
-    rays = np.ones((1, 3))
-    triangulate(rotations, translations, hosts, rays, seen, mask)
-    point_positions(rotations, translations, hosts, rays, ones)
-    median_shifts(seen, mask, 0, correlate(seen, mask, 0))
-    medians_of_nearest(seen[:, 0].copy(), seen[:, 1].copy(), ones, 1)
-    median(ones)
-    median_where(np.ones((1, 1)), mask[:, :1])
-    count_shared(ids, ids)
-    problem = Problem(hosts, np.tile(np.eye(4), (2, 1, 1)), np.zeros((2, 2, 1)),
-                      np.ones((2, 1), dtype=np.bool_), 1.0, 1, ones, ones, ones, 1.0)
-    state = ba.adjust(problem, State(rotations, translations, np.ones((3, 1))), 1)
-    reprojection.errors(problem, state)
-    reprojection.cost(problem, state)
-    schur.reduce(ba.linearise(problem, state, True, np.float64))
-    schur.depth_information(ba.linearise(problem, state, False, np.float64))

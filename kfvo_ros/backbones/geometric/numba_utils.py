@@ -1,48 +1,74 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""How the loops of this backbone are compiled: once, kept on disk, free of the interpreter.
+"""Numba compilation of the backbone's kernels, and compiled medians.
 
-What is kept is found by a function's name and the age of its file. But machine code also holds
-what is called in other files, and the layout of the tuples that come and go: a new version of
-those would be run by old code. So all that is compiled here has their digest in its name.
+Machine code is cached on disk. Numba looks it up by the function's name and the age of its source
+file, but the code also contains callees from other files and the layout of named tuples. Every
+compiled function therefore carries a digest of all those sources in its name, so that outdated
+machine code is never run.
 """
 
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numba
 import numpy as np
+from numba import boolean, float64, int64
 
-_compile = numba.njit(cache=True, nogil=True, error_model='numpy',
-                      fastmath={'contract', 'reassoc'})
-"""Sums may be taken in any order, which lets the processor take several terms at a time."""
+Kernel = TypeVar('Kernel', bound=Callable[..., Any])
+
+_jit = numba.njit(cache=True, nogil=True, error_model='numpy', fastmath={'contract', 'reassoc'})
+"""Reassociation lets the processor vectorise sums."""
+
+_entry_points: list[tuple[Any, tuple[Any, ...]]] = []
+"""Compiled functions and the argument types to compile them for."""
 
 
-def _digest() -> str:
-    """Return a few digits that another version of any of the sources changes."""
+def _source_digest() -> str:
+    """Return 8 hex digits of a hash over all sources with compiled functions or named tuples."""
     sources = [path.read_bytes() for path in sorted(Path(__file__).parent.glob('*.py'))]
     return hashlib.sha256(b''.join(
-        source for source in sources if b'@compiled' in source or b'(NamedTuple)' in source)
+        source for source in sources
+        if any(mark in source for mark in (b'@compiled', b'@entry_point', b'(NamedTuple)')))
     ).hexdigest()[:8]
 
 
-_DIGEST = _digest()
+_DIGEST = _source_digest()
 
 
-def compiled(function: Any) -> Any:
-    """Compile a function of arrays, numbers and named tuples when it is called first."""
+def compiled(function: Kernel) -> Kernel:
+    """Compile a function of arrays, numbers and named tuples at its first call.
+
+    It is for helpers of entry points, which are compiled with their callers.
+    """
     function.__qualname__ += f'_{_DIGEST}'
-    return _compile(function)
+    return _jit(function)
+
+
+def entry_point(*argument_types: Any) -> Callable[[Kernel], Kernel]:
+    """Return a decorator for a compiled function that the interpreter calls with these types."""
+    def register(function: Kernel) -> Kernel:
+        kernel = compiled(function)
+        _entry_points.append((kernel, argument_types))
+        return kernel
+    return register
+
+
+def compile_entry_points() -> None:
+    """Compile the entry points of all imported modules, or load them from the cache."""
+    for kernel, argument_types in _entry_points:
+        kernel.compile(argument_types)
 
 
 @compiled
-def _gather(values: np.ndarray, first: int, last: int, limit: float) -> int:
-    """Bring those of values[first:last] below the limit to the front; return where they end.
+def _partition(values: np.ndarray, first: int, last: int, limit: float) -> int:
+    """Move the values below `limit` to the front of values[first:last]; return their end.
 
-    No step depends on a comparison: a processor loses time where it cannot foresee the next one.
+    The loop has no branch: mispredicted ones cost more than the swaps.
     """
     end = first
     for k in range(first, last):
@@ -54,23 +80,23 @@ def _gather(values: np.ndarray, first: int, last: int, limit: float) -> int:
 
 @compiled
 def _select(values: np.ndarray, rank: int) -> float:
-    """Return the value of a rank, counted from 0, and bring all below it before it."""
+    """Return the value of a rank, counted from 0, and move all smaller ones before it."""
     first, last = 0, len(values)
     while True:
         pivot = values[(first + last) // 2]
-        less_end = _gather(values, first, last, pivot)
+        less_end = _partition(values, first, last, pivot)
         if rank < less_end:
             last = less_end
             continue
-        equal_end = _gather(values, less_end, last, np.nextafter(pivot, np.inf))
+        equal_end = _partition(values, less_end, last, np.nextafter(pivot, np.inf))
         if rank < equal_end or equal_end == less_end:  # Nothing equals NaN, or exceeds inf.
             return pivot
         first = equal_end
 
 
-@compiled
+@entry_point(float64[::1])
 def median(values: np.ndarray) -> float:
-    """Return the median of (N,), N >= 1: as NumPy's, which spends ten times as long on few."""
+    """Return the median of (N,), N >= 1; equals NumPy's, at a tenth of its time for small N."""
     values = values.copy()
     half = len(values) // 2
     upper = lower = _select(values, half)
@@ -81,9 +107,9 @@ def median(values: np.ndarray) -> float:
     return 0.5 * (lower + upper)
 
 
-@compiled
+@entry_point(float64[:, ::1], boolean[:, ::1])
 def median_where(values: np.ndarray, mask: np.ndarray) -> tuple[float, int]:
-    """Return the median of `values` (F, P) under `mask`, and how many there are; 0 without any."""
+    """Return the median of `values` (F, P) under `mask`, 0 for an empty one, and their count."""
     kept, count = np.empty(values.size + 1), 0
     for row in range(values.shape[0]):
         for column in range(values.shape[1]):
@@ -92,16 +118,20 @@ def median_where(values: np.ndarray, mask: np.ndarray) -> tuple[float, int]:
     return (median(kept[:count]) if count > 0 else 0.0), count
 
 
-@compiled
-def medians_of_nearest(places, known_places, known_values, neighbours):
-    """Return medians (N,) of the values of the known points nearest to each place (N, 2)."""
-    medians = np.zeros(len(places))
+@entry_point(float64[:, ::1], float64[:, ::1], float64[::1], int64)
+def medians_of_nearest(queries: np.ndarray, points: np.ndarray, values: np.ndarray,
+                       neighbours: int) -> np.ndarray:
+    """Return medians (N,) of the `values` (M,) of the nearest `points` (M, 2) to `queries` (N, 2).
+
+    `neighbours` <= M is the number of nearest points.
+    """
+    medians = np.zeros(len(queries))
     distances, nearest = np.zeros(neighbours), np.zeros(neighbours)
-    for n in range(len(places)):
+    for n in range(len(queries)):
         distances[:] = np.inf
-        for k in range(len(known_values)):
-            x, y = known_places[k, 0] - places[n, 0], known_places[k, 1] - places[n, 1]
-            distance, value = x * x + y * y, known_values[k]
+        for k in range(len(values)):
+            x, y = points[k, 0] - queries[n, 0], points[k, 1] - queries[n, 1]
+            distance, value = x * x + y * y, values[k]
             if distance >= distances[-1]:
                 continue
             for rank in range(neighbours):

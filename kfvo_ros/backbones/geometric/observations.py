@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Who sees what in a window: tracks as a table of points by frames."""
+"""Track table of a window: points x frames."""
 
 from __future__ import annotations
 
@@ -8,23 +8,23 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numba import float64, int64
 
-from kfvo_ros.backbones.geometric.numba_utils import compiled
+from kfvo_ros.backbones.geometric.numba_utils import compiled, entry_point
 from kfvo_ros.backbones.geometric.self_calibration import IntrinsicsFilter
 from kfvo_ros.tracking.tracker import Tracks
 
-HALF_BELIEVED = 0.1
-"""A track whose patches part by so much in each frame weighs half as much as one that is sure
-[px]."""
-END = np.iinfo(np.int64).max
-"""No track has this id."""
+HALF_WEIGHT_UNCERTAINTY = 0.1
+"""Uncertainty of a track with half the weight of a certain one [px]."""
+MAX_ID = np.iinfo(np.int64).max
+"""Greater than all track ids."""
 
 
 @dataclass(frozen=True)
 class FrameTracks:
-    """What one frame sees: ``tracks`` in pixels, and where they lie undistorted.
+    """Observations of one frame: ``tracks`` in pixels and as undistorted ``points``.
 
-    ``points`` (N, 2) are normalised, undistorted coordinates of the same tracks, by the
+    ``points`` (N, 2) are normalised coordinates of the same tracks, undistorted by the
     calibration; ``index`` counts the input frames of the stream.
     """
 
@@ -35,15 +35,15 @@ class FrameTracks:
 
 @dataclass(frozen=True)
 class TrackTable:
-    """The tracks that at least two of F frames see.
+    """P tracks that at least two of F frames observe.
 
-    ``ids`` (P,) increasing; ``seen`` (P, F, 2) normalised coordinates under ``mask`` (P, F);
-    ``hosts`` (P,) the first frame that sees a point and ``rays`` (P, 3) its ray there; its tracks
-    are to be believed ``certainty`` (P,) times as much as the best.
+    ``ids`` (P,) increase; ``image_points`` (P, F, 2) are normalised coordinates under ``mask``
+    (P, F); ``hosts`` (P,) are the first frames that observe a point and ``rays`` (P, 3) its rays
+    there; ``certainty`` (P,) is the weight of residuals, 1 for tracks without uncertainty.
     """
 
     ids: np.ndarray
-    seen: np.ndarray
+    image_points: np.ndarray
     mask: np.ndarray
     hosts: np.ndarray
     rays: np.ndarray
@@ -53,54 +53,76 @@ class TrackTable:
         return len(self.ids)
 
 
-def build_track_table(views: Sequence[FrameTracks], anchor: int, lens: IntrinsicsFilter) -> TrackTable:
-    """Gather the tracks of `views`, oldest first, that a frame after the anchor sees."""
-    ids, seen, mask, hosts, doubts = merge_tracks(
-        np.concatenate([view.tracks.ids for view in views]),
-        lens.straighten(np.concatenate([view.points for view in views])),
-        np.concatenate([view.tracks.doubts for view in views]),
-        np.cumsum([len(view.points) for view in views]), anchor + 1)
+def build_track_table(frames: Sequence[FrameTracks], anchor: int,
+                      intrinsics_filter: IntrinsicsFilter) -> TrackTable:
+    """Return the tracks of `frames`, oldest first, that a frame after the anchor observes."""
+    ids, image_points, mask, hosts, uncertainty = merge_tracks(
+        np.concatenate([frame.tracks.ids for frame in frames]),
+        intrinsics_filter.undistort(np.concatenate([frame.points for frame in frames])),
+        np.concatenate([frame.tracks.uncertainty for frame in frames]),
+        np.cumsum([len(frame.points) for frame in frames]), anchor + 1)
     rays = np.ones((len(ids), 3))
-    rays[:, :2] = seen[np.arange(len(ids)), hosts]
-    return TrackTable(ids, seen, mask, hosts, rays,
-                      1.0 / np.sqrt(1.0 + np.square(doubts / HALF_BELIEVED)))
+    rays[:, :2] = image_points[np.arange(len(ids)), hosts]
+    return TrackTable(ids, image_points, mask, hosts, rays,
+                      1.0 / np.sqrt(1.0 + np.square(uncertainty / HALF_WEIGHT_UNCERTAINTY)))
+
+
+@entry_point(int64[::1], float64[:, ::1], float64[::1], int64[::1], int64)
+def merge_tracks(ids: np.ndarray, points: np.ndarray, uncertainty: np.ndarray, ends: np.ndarray,
+                 first_moving: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray,
+                                             np.ndarray]:
+    """Return ids, image points, mask, hosts and uncertainty of the tracks of a `TrackTable`.
+
+    `ids` (N,), `points` (N, 2) and `uncertainty` (N,) are the frames' concatenated tracks. Each
+    frame's ids increase and stop before its entry of `ends` (F,). A track is kept when two frames
+    observe it, of which one is at or after `first_moving`; its last uncertainty counts.
+    """
+    frames, capacity, count = len(ends), len(ids) // 2, 0
+    kept_ids, hosts = np.empty(capacity, dtype=np.int64), np.empty(capacity, dtype=np.int64)
+    image_points = np.empty((capacity, frames, 2))
+    mask = np.empty((capacity, frames), dtype=np.bool_)
+    kept_uncertainty = np.empty(capacity)
+    heads = np.zeros(frames, dtype=np.int64)  # Each frame's first track that is not merged yet.
+    for frame in range(1, frames):
+        heads[frame] = ends[frame - 1]
+    while True:
+        track_id, observations, first, last = _next_track(ids, heads, ends)
+        if observations == 0:
+            return (kept_ids[:count], image_points[:count], mask[:count], hosts[:count],
+                    kept_uncertainty[:count])
+        if observations >= 2 and last >= first_moving:
+            kept_ids[count], hosts[count] = track_id, first
+            kept_uncertainty[count] = uncertainty[heads[last]]
+            _fill_row(track_id, ids, points, heads, ends, image_points[count], mask[count])
+            count += 1
+        for frame in range(first, last + 1):
+            heads[frame] += heads[frame] < ends[frame] and ids[heads[frame]] == track_id
 
 
 @compiled
-def merge_tracks(ids, points, doubts, ends, first_moving):
-    """Return the tracks (ids, seen, mask, hosts, doubts) that two views see, one of them moving.
+def _next_track(ids: np.ndarray, heads: np.ndarray,
+                ends: np.ndarray) -> tuple[int, int, int, int]:
+    """Return the lowest id at the heads, its number of observations, its first and last frame.
 
-    `ids` (N,), `points` (N, 2) and `doubts` (N,) are those of all views, one after the other; each
-    view's ids increase, and end before `ends` (F,). Views from `first_moving` on move. Of doubts
-    the last one counts.
+    There are 0 observations after the last track.
     """
-    frames, count = len(ends), 0
-    heads = np.zeros(frames, dtype=np.int64)
-    for frame in range(1, frames):
-        heads[frame] = ends[frame - 1]
-    merged = np.empty(len(ids) // 2, dtype=np.int64)
-    seen = np.empty((len(merged), frames, 2))
-    mask = np.empty((len(merged), frames), dtype=np.bool_)
-    hosts, doubted = np.empty(len(merged), dtype=np.int64), np.empty(len(merged))
-    while True:
-        lowest, views, first, last = END, 0, -1, -1
-        for frame in range(frames):
-            head = heads[frame]
-            if head < ends[frame] and ids[head] <= lowest:
-                if ids[head] < lowest:
-                    lowest, views, first = ids[head], 0, frame
-                views, last = views + 1, frame
-        if views == 0:
-            return merged[:count], seen[:count], mask[:count], hosts[:count], doubted[:count]
-        wanted = views >= 2 and last >= first_moving
-        if wanted:
-            merged[count], hosts[count], doubted[count] = lowest, first, doubts[heads[last]]
-        for frame in range(frames):
-            head = heads[frame]
-            sees = head < ends[frame] and ids[head] == lowest
-            heads[frame] += sees
-            if wanted:
-                mask[count, frame] = sees
-                seen[count, frame, 0] = points[head, 0] if sees else 0.0
-                seen[count, frame, 1] = points[head, 1] if sees else 0.0
-        count += wanted
+    lowest, observations, first, last = MAX_ID, 0, -1, -1
+    for frame in range(len(ends)):
+        head = heads[frame]
+        if head < ends[frame] and ids[head] <= lowest:
+            if ids[head] < lowest:
+                lowest, observations, first = ids[head], 0, frame
+            observations, last = observations + 1, frame
+    return lowest, observations, first, last
+
+
+@compiled
+def _fill_row(track_id: int, ids: np.ndarray, points: np.ndarray, heads: np.ndarray,
+              ends: np.ndarray, image_points: np.ndarray, mask: np.ndarray) -> None:
+    """Fill a track's image points (F, 2) and mask (F,) from the heads that it is at."""
+    for frame in range(len(ends)):
+        head = heads[frame]
+        observed = head < ends[frame] and ids[head] == track_id
+        mask[frame] = observed
+        image_points[frame, 0] = points[head, 0] if observed else 0.0
+        image_points[frame, 1] = points[head, 1] if observed else 0.0

@@ -1,11 +1,11 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Normal equations of poses and points, solved for the poses first (Schur complement); compiled.
+"""Schur complement of normal equations: points are eliminated, poses are solved for; compiled.
 
-Each point has three unknowns that nothing but poses couple to others: with the Cholesky factors L
-of their own 3x3 blocks, what couples them is made white, L^-1 H_pc, and its products are what the
-poses' system loses. Those take most of the time, and less in numbers of 32 bits: exact enough for
-a step, which is tried before it is believed, but not for what is told of a solved window.
+Only poses couple points to each other, so each point has its own 3x3 block. With the Cholesky
+factors L of those blocks the coupling is whitened, L^-1 H_pc, and its products are subtracted from
+the poses' system. These products take most of the time. In float32 they take less; that is exact
+enough for a step, whose cost is checked, but not for covariances.
 """
 
 from __future__ import annotations
@@ -13,16 +13,18 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numba import float64
 
-from kfvo_ros.backbones.geometric.numba_utils import compiled
-from kfvo_ros.backbones.geometric.reprojection import NormalEquations
+from kfvo_ros.backbones.geometric.numba_utils import compiled, entry_point
+from kfvo_ros.backbones.geometric.reprojection import NORMAL_EQUATIONS, NormalEquations
 
-TINY = 1e-9
+REGULARISATION = 1e-9
+"""Added to diagonals, which may be zero."""
 
 
 @compiled
 def dot(a: np.ndarray, b: np.ndarray) -> float:
-    """Return the product of two vectors (N,): BLAS would take longer to be called."""
+    """Return the dot product of vectors (N,); for few numbers a call of BLAS takes longer."""
     total = a.dtype.type(0)
     for k in range(len(a)):
         total += a[k] * b[k]
@@ -30,8 +32,8 @@ def dot(a: np.ndarray, b: np.ndarray) -> float:
 
 
 @compiled
-def _add_nine(A: np.ndarray, B: np.ndarray, weight: float, total: np.ndarray) -> None:
-    """Add weight A B^T of three rows each: a number read is used three times."""
+def _add_3x3_products(A: np.ndarray, B: np.ndarray, weight: float, total: np.ndarray) -> None:
+    """Add weight A B^T of three rows each: every number that is loaded is used three times."""
     a0, a1, a2, b0, b1, b2 = A[0], A[1], A[2], B[0], B[1], B[2]
     s00 = s01 = s02 = s10 = s11 = s12 = s20 = s21 = s22 = A.dtype.type(0)
     for k in range(len(a0)):
@@ -52,13 +54,13 @@ def _add_nine(A: np.ndarray, B: np.ndarray, weight: float, total: np.ndarray) ->
 
 @compiled
 def add_products(A: np.ndarray, weight: float, total: np.ndarray) -> None:
-    """Add weight A A^T of A (M, N) to `total` (M, M), which is and stays symmetric."""
+    """Add weight A A^T of A (M, N) to the symmetric `total` (M, M)."""
     size = len(A)
     threes = size - size % 3
     for row in range(0, threes, 3):
         for column in range(0, row + 1, 3):
-            _add_nine(A[row:row + 3], A[column:column + 3], weight,
-                      total[row:row + 3, column:column + 3])
+            _add_3x3_products(A[row:row + 3], A[column:column + 3], weight,
+                              total[row:row + 3, column:column + 3])
     for row in range(threes, size):
         for column in range(row + 1):
             total[row, column] += weight * dot(A[row], A[column])
@@ -67,24 +69,24 @@ def add_products(A: np.ndarray, weight: float, total: np.ndarray) -> None:
             total[column, row] = total[row, column]
 
 
-@compiled
-def _factor(H: np.ndarray, damping: float) -> np.ndarray:
+@entry_point(float64[:, ::1], float64)
+def _factorise_points(H: np.ndarray, damping: float) -> np.ndarray:
     """Return lower triangles (6, P) of the points' Cholesky factors, diagonals inverted."""
     L, grown = np.empty(H.shape), 1.0 + damping
     for k in range(H.shape[1]):
-        xx = 1.0 / math.sqrt(H[0, k] * grown + TINY)
+        xx = 1.0 / math.sqrt(H[0, k] * grown + REGULARISATION)
         yx = H[1, k] * xx
-        yy = 1.0 / math.sqrt(max(H[2, k] * grown - yx * yx, 0.0) + TINY)
+        yy = 1.0 / math.sqrt(max(H[2, k] * grown - yx * yx, 0.0) + REGULARISATION)
         rx = H[3, k] * xx
         ry = (H[4, k] - rx * yx) * yy
-        rr = 1.0 / math.sqrt(max(H[5, k] * grown - rx * rx - ry * ry, 0.0) + TINY)
+        rr = 1.0 / math.sqrt(max(H[5, k] * grown - rx * rx - ry * ry, 0.0) + REGULARISATION)
         L[0, k], L[1, k], L[2, k], L[3, k], L[4, k], L[5, k] = xx, yx, yy, rx, ry, rr
     return L
 
 
 @compiled
 def _whiten(L: np.ndarray, v: np.ndarray) -> None:
-    """Make L^-1 v of v (3, P) in place."""
+    """Replace v (3, P) by L^-1 v."""
     for k in range(v.shape[1]):
         x = v[0, k] * L[0, k]
         y = (v[1, k] - L[1, k] * x) * L[2, k]
@@ -93,38 +95,39 @@ def _whiten(L: np.ndarray, v: np.ndarray) -> None:
 
 
 @compiled
-def _eliminate(normal: NormalEquations, damping: float,
-               L: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return system and gradient of the poses, and the white gradient (3, P) of the points.
+def _eliminate_points(normal: NormalEquations, damping: float,
+                      L: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return system and gradient of the poses, and the whitened gradient (3, P) of the points.
 
-    What couples the two is whitened in place.
+    The coupling H_cp is whitened in place.
     """
     size, system, gradient = len(normal.g_c), normal.H_cc.copy(), normal.g_c.copy()
-    pull = normal.g_p.astype(L.dtype)
-    _whiten(L, pull)
+    point_gradient = normal.g_p.astype(L.dtype)
+    _whiten(L, point_gradient)
     for row in range(size):
         _whiten(L, normal.H_cp[row])
-    white, flat = normal.H_cp.reshape(size, pull.size), pull.reshape(pull.size)
-    add_products(white, -1.0, system)
+    coupling = normal.H_cp.reshape(size, point_gradient.size)
+    flat = point_gradient.reshape(point_gradient.size)
+    add_products(coupling, -1.0, system)
     for row in range(size):
-        system[row, row] += damping * normal.H_cc[row, row] + TINY
-        gradient[row] -= dot(white[row], flat)
-    return system, gradient, pull
+        system[row, row] += damping * normal.H_cc[row, row] + REGULARISATION
+        gradient[row] -= dot(coupling[row], flat)
+    return system, gradient, point_gradient
 
 
-@compiled
-def reduce(normal: NormalEquations) -> tuple[np.ndarray, np.ndarray]:
-    """Eliminate the points (Schur complement); return system and gradient of the poses.
+@entry_point(NORMAL_EQUATIONS)
+def marginalise_points(normal: NormalEquations) -> tuple[np.ndarray, np.ndarray]:
+    """Return system (C, C) and gradient (C,) of the poses without the points.
 
-    The equations are used up: a copy of them would not fit into the processor's cache.
+    H_cp is overwritten: a copy would not fit into the processor's cache.
     """
-    system, gradient, _ = _eliminate(normal, 0.0, _factor(normal.H_pp, 0.0))
+    system, gradient, _ = _eliminate_points(normal, 0.0, _factorise_points(normal.H_pp, 0.0))
     return system, gradient
 
 
 @compiled
-def _solve(system: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Solve a symmetric, positive definite system, both overwritten: no pivot is ever needed."""
+def _solve_positive(system: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Solve a symmetric positive definite system without pivoting; both are overwritten."""
     size = len(right)
     for pivot in range(size):
         for row in range(pivot + 1, size):
@@ -140,14 +143,14 @@ def _solve(system: np.ndarray, right: np.ndarray) -> np.ndarray:
 
 
 @compiled
-def step(normal: NormalEquations, damping: float) -> tuple[np.ndarray, np.ndarray]:
+def solve_step(normal: NormalEquations, damping: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the damped Gauss-Newton step of free poses (C,) and points (3, P).
 
-    The equations are used up.
+    H_cp is overwritten.
     """
-    L = _factor(normal.H_pp, damping).astype(normal.H_cp.dtype)
-    system, gradient, pull = _eliminate(normal, damping, L)
-    poses, points = -_solve(system, gradient), -pull
+    L = _factorise_points(normal.H_pp, damping).astype(normal.H_cp.dtype)
+    system, gradient, point_gradient = _eliminate_points(normal, damping, L)
+    poses, points = -_solve_positive(system, gradient), -point_gradient
     for row in range(len(poses)):
         share = L.dtype.type(poses[row])
         for a in range(3):
@@ -163,5 +166,5 @@ def step(normal: NormalEquations, damping: float) -> tuple[np.ndarray, np.ndarra
 
 
 def depth_information(normal: NormalEquations) -> np.ndarray:
-    """Return what is known of the points' inverse depths (P,), given the poses, rays unknown."""
-    return 1.0 / _factor(normal.H_pp, 0.0)[5] ** 2
+    """Return the information (P,) on inverse depths, given the poses, rays marginalised."""
+    return 1.0 / _factorise_points(normal.H_pp, 0.0)[5] ** 2

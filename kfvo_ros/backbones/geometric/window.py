@@ -1,10 +1,11 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""One window from tracks to poses: first guess, bundle adjustment, outliers, covariance."""
+"""Solve one window: competing initial guesses, bundle adjustment, outliers, covariance."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
 
@@ -14,59 +15,58 @@ from kfvo_ros import geometry
 from kfvo_ros.backbones.base import Points, WindowPrior
 from kfvo_ros.backbones.geometric import bundle_adjustment as ba
 from kfvo_ros.backbones.geometric import numba_utils, reprojection, triangulation
-from kfvo_ros.backbones.geometric.initialisation import Guess, Initialiser
+from kfvo_ros.backbones.geometric.initialisation import InitialGuess, Initialiser
 from kfvo_ros.backbones.geometric.keyframe_history import HistoryFrames, history_of
 from kfvo_ros.backbones.geometric.observations import TrackTable
 from kfvo_ros.backbones.geometric.reprojection import Problem, State
-from kfvo_ros.backbones.geometric.schur import depth_information, reduce
+from kfvo_ros.backbones.geometric.schur import depth_information, marginalise_points
 
 ITERATIONS, FINAL_ITERATIONS = 3, 4
-WIDE = 1.0
-"""Width of the loss at first [px]: a rough start is pulled from afar."""
-NARROW = 1.7
-"""... and in the end, times the noise: a track that slides a little, as along the rim of something
-near, should hardly pull."""
-MAX_NOISE, MAX_ERROR = 4.5, (2.0, 5.0)
-"""Tracks farther off anywhere after the first adjustment are outliers: so many times the noise,
-within bounds [px], for where nothing fits noise has none."""
+INITIAL_WIDTH = 1.0
+"""Width of the loss at first [px]: wide for a rough start ..."""
+FINAL_WIDTH = 1.7
+"""... and in the end, times the noise: tracks that slide slightly, as along the outline of a near
+object, get little weight."""
+MAX_NOISE_RATIO, MAX_ERROR_BOUNDS = 4.5, (2.0, 5.0)
+"""Tracks with a larger error in any frame are outliers: a multiple of the noise, within bounds
+[px] because the noise has no bound where nothing fits."""
 TRUSTED_DEPTH_PRIOR = 1.0
-"""How strongly a point whose depth was measured holds its last [px^2 for one wrong by 100 %].
+"""Weight of the prior on a depth that was measured well [px^2 for an error of 100 %].
 
-It keeps the scale through rotation and hovering, where nothing is measured."""
+It keeps the scale through rotation and hovering, where no depth is measured."""
 DEPTH_PRIOR = 0.05
-"""The same for others: of what rotation brought into view the depth is but supposed, and hundreds
-that hold on to it would outweigh the motion after it."""
-LEAST_PRIOR_SPREAD = 0.2
-"""The same for points so far away that 100 % of their inverse depth is nothing: this share of
-the median's."""
-SUSPICIOUS_SHARE = 0.5
-"""When fewer of the newest frame's tracks fit, its first place may have been wrong."""
-WELL_KNOWN = 0.1
-"""A depth whose standard deviation is no larger a share of it is worth to be held on to."""
-LEAST_INFORMATION = 1e-12
-"""So much is known of every direction, as a share of the best known: where it is all, the
-covariance is large."""
-LEAST_NOISE = 0.1
-"""Tracks are never believed to be better than this [px]."""
-LEAST_FREEDOM = 0.25
-"""A window fits two views of a point exactly in one direction of two."""
+"""Weight for other depths: those of points that rotation brought into view are only assumed, and
+hundreds of them must not outweigh the motion that follows."""
+MIN_PRIOR_SPREAD = 0.2
+"""Least inverse depth that priors are relative to, as a share of the median: for far points 100 %
+of their own is nearly nothing."""
+MIN_INLIER_SHARE = 0.5
+"""Below this share of inliers in the newest frame, its initial pose may have been wrong."""
+WELL_MEASURED_SIGMA = 0.1
+"""Largest relative standard deviation of a depth that was measured well."""
+MIN_INFORMATION = 1e-12
+"""Information on unobserved directions, as a share of the best observed one."""
+MIN_NOISE = 0.1
+"""Least noise of tracks [px]."""
+MIN_FREEDOM = 0.25
+"""Least share of degrees of freedom; two observations of a point leave one of four."""
 
 
 @dataclass(frozen=True)
 class Solution:
-    """A solved window; frame ``anchor`` is identity, those before it are its history.
+    """A solved window; frame ``anchor`` is the identity, those before it are its history.
 
-    The mask of ``problem`` (F, P) is what is left of the observations.
+    The mask of ``problem`` (F, P) marks the inliers of ``table``.
     """
 
-    observations: TrackTable
+    table: TrackTable
     anchor: int
     problem: Problem
     state: State
 
     @property
     def solved(self) -> np.ndarray:
-        """Mask (P,) of the points whose tracks are left."""
+        """Mask (P,) of the points with inliers."""
         return np.asarray(self.problem.mask.any(axis=0))
 
     @cached_property
@@ -78,18 +78,18 @@ class Solution:
 
     @property
     def measured(self) -> bool:
-        """Whether depths are measured well enough to be held on to."""
-        return self.median_information > self._enough
+        """Whether the median depth is measured well."""
+        return self.median_information > self._sufficient_information
 
     @property
-    def well_known(self) -> np.ndarray:
-        """Mask (N,) of the points whose own depths are."""
-        return self.points.information > self._enough
+    def well_measured(self) -> np.ndarray:
+        """Mask (N,) of the solved points whose own depth is measured well."""
+        return self.points.information > self._sufficient_information
 
     @property
-    def _enough(self) -> float:
-        """Information on a depth that is well known from tracks as noisy as these."""
-        return (self.noise / WELL_KNOWN) ** 2
+    def _sufficient_information(self) -> float:
+        """Information, for 1 px noise, on a depth that is measured well despite the noise."""
+        return (self.noise / WELL_MEASURED_SIGMA) ** 2
 
     @cached_property
     def median_information(self) -> float:
@@ -103,68 +103,62 @@ class Solution:
 
     @cached_property
     def noise(self) -> float:
-        """How far the tracks that are left are off [px]."""
+        """Noise of the inliers [px]."""
         return _noise(self.problem, reprojection.errors(self.problem, self.state))
 
     @cached_property
     def points(self) -> Points:
-        """Return the solved points; a depth's information is that given the poses."""
+        """Return the solved points; the information on their depths is given the poses."""
         rows = np.flatnonzero(self.solved)
         given_poses = self.problem._replace(fixed=len(self.problem.mask))
         information = depth_information(ba.linearise(given_poses, self.state, False, np.float64))
         x, y, r = (part[rows] for part in self.state.points)
         origins = self.problem.origins
-        positions = triangulation.point_positions(origins[:, :3, :3].copy(), origins[:, :3, 3].copy(),
-                                                  self.problem.hosts[rows],
-                                                  np.stack([x, y, np.ones(len(rows))], axis=1), r)
-        return Points(self.observations.ids[rows], positions, information[rows] * r ** 2)
+        positions = triangulation.point_positions(
+            origins[:, :3, :3].copy(), origins[:, :3, 3].copy(), self.problem.hosts[rows],
+            np.stack([x, y, np.ones(len(rows))], axis=1), r)
+        return Points(self.table.ids[rows], positions, information[rows] * r ** 2)
 
     def covariance(self) -> np.ndarray:
         """Return covariances (S, 6, 6) from the anchor on, in it, translation first.
 
-        It contains how well the window's scale is tied to the past, by history and depth
-        priors: where points have no parallax it grows, which reprojection errors do not show.
+        They include the uncertainty of the window's scale, which history and depth priors tie to
+        the past: it grows without parallax, while reprojection errors stay small.
         """
-        system, _ = reduce(ba.linearise(self.problem, self.state, False, np.float64))
+        system, _ = marginalise_points(
+            ba.linearise(self.problem, self.state, False, np.float64))
         free = len(system) // 6
-        blocks = self.noise ** 2 * _inverse(system).reshape(free, 6, free, 6)
-        turns = np.zeros((free, 6, 6))
-        turns[:, :3, 3:] = turns[:, 3:, :3] = self.state.rotations[self.anchor + 1:]
+        blocks = self.noise ** 2 * _regularised_inverse(system).reshape(free, 6, free, 6)
+        to_anchor = np.zeros((free, 6, 6))
+        to_anchor[:, :3, 3:] = to_anchor[:, 3:, :3] = self.state.rotations[self.anchor + 1:]
         covariance = np.zeros((free + 1, 6, 6))
         own = np.arange(free)
-        covariance[1:] = turns @ blocks[own, :, own] @ np.swapaxes(turns, 1, 2)
+        covariance[1:] = to_anchor @ blocks[own, :, own] @ np.swapaxes(to_anchor, 1, 2)
         return 0.5 * (covariance + np.swapaxes(covariance, 1, 2))
 
 
-def solve(observations: TrackTable, initialiser: Initialiser, previous: WindowPrior | None,
+def solve(table: TrackTable, initialiser: Initialiser, prior: WindowPrior | None,
           history: HistoryFrames) -> Solution:
-    """Place the frames of a window in the anchor, in the unit of `previous`, else median depth 1.
+    """Return the window's poses in the anchor, in the unit of `prior` or else the median depth.
 
-    A draft moves the newest frame alone: the others hardly change. But what the last window found
-    may be a wrong minimum. While little is known, a start from nothing competes with it; where
-    the window is doubted, one from its history; and these drafts move all frames.
+    Candidates are adjusted from different initial guesses and the one of least cost is refined.
+    Usually only the newest frame is free while they compete. Before the stream is initialised,
+    and where the window has unmeasured depths, the prior may be a wrong minimum: all frames after
+    the anchor are free then.
     """
-    anchor, certain = len(history.views), history_of(previous).certain
-    settled = certain and not history.doubted
-    fixed = observations.mask.shape[1] - 1 if settled else anchor + 1
-    draft = partial(_draft, observations, initialiser.focal, fixed)
-    drafts = []
-    if previous is not None and previous.points is not None:
-        drafts.append(draft(initialiser.from_previous(observations, previous, history)))
-        if drafts[0].newest_inlier_share < SUSPICIOUS_SHARE:
-            drafts.append(draft(initialiser.from_previous(observations, previous, history, True)))
-        if history.doubted:
-            drafts.append(draft(initialiser.from_history(observations, previous, history)))
-    if not certain:
-        pair = initialiser.best_pair(observations)
-        if pair is not None or not drafts:
-            drafts.append(draft(initialiser.from_nothing(observations, pair)))
-    return _finish(observations, min(drafts, key=lambda each: each.cost), anchor)
+    anchor = len(history.frames)
+    settled = history_of(prior).initialised and not history.has_unmeasured
+    fixed = table.mask.shape[1] - 1 if settled else anchor + 1
+    adjusted: dict[str, _Adjusted] = {}
+    for candidate in _candidates(table, initialiser, prior, history):
+        if candidate.competes(adjusted):
+            adjusted[candidate.name] = _adjust(table, initialiser.focal, fixed, candidate.guess())
+    return _refine(table, min(adjusted.values(), key=lambda each: each.cost), anchor)
 
 
 @dataclass(frozen=True)
-class _Draft:
-    """A window adjusted with all its observations, of which ``inliers`` (F, P) fit."""
+class _Adjusted:
+    """A candidate after adjustment to all observations, of which ``inliers`` (F, P) fit."""
 
     problem: Problem
     state: State
@@ -174,52 +168,90 @@ class _Draft:
 
     @property
     def newest_inlier_share(self) -> float:
-        """Share of the newest frame's observations that fit."""
+        """Share of inliers among the newest frame's observations."""
         return float(self.inliers[-1].sum()) / max(1, self.problem.mask[-1].sum())
 
 
-def _draft(observations: TrackTable, focal: float, fixed: int, guess: Guess) -> _Draft:
-    """Adjust from a guess and tell the outliers: a track that is wrong once has slid before."""
-    problem = _problem(observations, focal, guess, fixed)
+@dataclass(frozen=True)
+class _Candidate:
+    """An initial guess that ``competes`` or not, given the candidates adjusted before it."""
+
+    name: str
+    competes: Callable[[Mapping[str, _Adjusted]], bool]
+    guess: Callable[[], InitialGuess]
+
+
+def _candidates(table: TrackTable, initialiser: Initialiser, prior: WindowPrior | None,
+                history: HistoryFrames) -> list[_Candidate]:
+    """Return the candidates of a window in order; of equal costs the first wins."""
+    candidates = []
+    if prior is not None and prior.points is not None:
+        candidates += [
+            _Candidate('resection', lambda adjusted: True,
+                       partial(initialiser.from_prior, table, prior, history)),
+            _Candidate('epipolar geometry',
+                       lambda adjusted: (adjusted['resection'].newest_inlier_share
+                                         < MIN_INLIER_SHARE),
+                       partial(initialiser.from_prior, table, prior, history, True)),
+            _Candidate('history', lambda adjusted: history.has_unmeasured,
+                       partial(initialiser.from_history, table, prior, history))]
+    if not history_of(prior).initialised:
+        pair = initialiser.best_pair(table)
+        candidates.append(
+            _Candidate('bootstrap', lambda adjusted: pair is not None or not adjusted,
+                       partial(initialiser.bootstrap, table, pair)))
+    return candidates
+
+
+def _adjust(table: TrackTable, focal: float, fixed: int, guess: InitialGuess) -> _Adjusted:
+    """Adjust from a guess and find outliers: a track with one wrong observation is one as a whole.
+
+    It has slid before it became visibly wrong.
+    """
+    problem = _problem(table, focal, guess, fixed)
     state = ba.adjust(problem, guess.state, ITERATIONS)
     errors = reprojection.errors(problem, state)
     noise = _noise(problem, errors)
     largest = errors.max(axis=0) / problem.certainty
-    fits = largest <= np.clip(MAX_NOISE * noise, *MAX_ERROR)
-    return _Draft(problem, state, problem.mask & fits, noise, reprojection.cost(problem, state))
+    fits = largest <= np.clip(MAX_NOISE_RATIO * noise, *MAX_ERROR_BOUNDS)
+    return _Adjusted(problem, state, problem.mask & fits, noise,
+                     reprojection.cost(problem, state))
 
 
-def _finish(observations: TrackTable, draft: _Draft, anchor: int) -> Solution:
-    """Adjust again without the outliers, narrowly."""
-    problem = draft.problem._replace(mask=draft.inliers, width=NARROW * draft.noise,
-                                     fixed=anchor + 1)
-    state = ba.adjust(problem, draft.state, FINAL_ITERATIONS)
-    return Solution(observations, anchor, problem, state)
+def _refine(table: TrackTable, candidate: _Adjusted, anchor: int) -> Solution:
+    """Adjust all frames after the anchor to the inliers, with a narrow loss."""
+    problem = candidate.problem._replace(mask=candidate.inliers,
+                                         width=FINAL_WIDTH * candidate.noise, fixed=anchor + 1)
+    state = ba.adjust(problem, candidate.state, FINAL_ITERATIONS)
+    return Solution(table, anchor, problem, state)
+
+
+def _problem(table: TrackTable, focal: float, guess: InitialGuess, fixed: int) -> Problem:
+    """Return the bundle adjustment problem of a window, with priors on depths."""
+    expected = guess.expected_inverse_depths
+    strength = np.where(guess.trusted, TRUSTED_DEPTH_PRIOR, DEPTH_PRIOR)
+    spread = np.maximum(expected, MIN_PRIOR_SPREAD * numba_utils.median(expected))
+    origins = geometry.make_transform(guess.state.rotations, guess.state.translations)
+    return Problem(table.hosts, origins,
+                   np.ascontiguousarray(table.image_points.transpose(1, 2, 0)),
+                   np.ascontiguousarray(table.mask.T), focal, fixed, table.certainty,
+                   strength / spread ** 2, expected, INITIAL_WIDTH)
 
 
 def _noise(problem: Problem, errors: np.ndarray) -> float:
-    """Return the median of errors (F, P), had they not been fitted; 1 without any [px]."""
+    """Return the noise [px] that fits the median of errors (F, P), 1 without observations.
+
+    Fitted errors are smaller than the noise by the share of degrees of freedom.
+    """
     typical, count = numba_utils.median_where(errors, problem.mask)
     if not count:
         return 1.0
     fitted = 3 * problem.mask.any(axis=0).sum() + 6 * (len(problem.mask) - problem.fixed)
-    left = max(1.0 - fitted / (2 * count), LEAST_FREEDOM)
-    return max(LEAST_NOISE, typical / math.sqrt(left))
+    freedom = max(1.0 - fitted / (2 * count), MIN_FREEDOM)
+    return max(MIN_NOISE, typical / math.sqrt(freedom))
 
 
-def _problem(observations: TrackTable, focal: float, guess: Guess, fixed: int) -> Problem:
-    """Return the bundle adjustment of a window, depths drawn to where they are expected."""
-    expected = guess.expected_inverse_depths
-    strength = np.where(guess.trusted, TRUSTED_DEPTH_PRIOR, DEPTH_PRIOR)
-    spread = np.maximum(expected, LEAST_PRIOR_SPREAD * numba_utils.median(expected))
-    origins = geometry.make_transform(guess.state.rotations, guess.state.translations)
-    return Problem(observations.hosts, origins,
-                   np.ascontiguousarray(observations.seen.transpose(1, 2, 0)),
-                   np.ascontiguousarray(observations.mask.T),
-                   focal, fixed, observations.certainty, strength / spread ** 2, expected, WIDE)
-
-
-def _inverse(system: np.ndarray) -> np.ndarray:
-    """Return the inverse of a symmetric system, large in directions that nothing determines."""
-    least = LEAST_INFORMATION * system.diagonal().max()
+def _regularised_inverse(system: np.ndarray) -> np.ndarray:
+    """Return the inverse of a symmetric system, large in unobserved directions."""
+    least = MIN_INFORMATION * system.diagonal().max()
     return np.linalg.inv(system + least * np.eye(len(system)))

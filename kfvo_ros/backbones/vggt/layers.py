@@ -1,9 +1,10 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Rotary position embedding in two dimensions: a token's place turns its queries and keys.
+"""The transformer block of DINOv2, aggregator and camera head, and its rotary position embedding.
 
-The first half of a head's channels is turned by the row, the second by the column; within a
-half, channel j is paired with channel j + a quarter of the head ("rotate half").
+Every layer computes in the dtype of its own weights and casts its input. The dtypes in which
+weights are stored are therefore the whole precision policy: with matrices in bfloat16 and norms
+and scales in float32, the residual stream stays in float32, because the scales promote it.
 """
 
 from __future__ import annotations
@@ -14,71 +15,76 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from kfvo_ros.backbones.vggt.config import HEAD_SIZE, SPECIAL
+from kfvo_ros.backbones.vggt.config import HEAD_DIM, NUM_PREFIX_TOKENS
 
 ROPE_BASE = 100.0
-"""Wave lengths rise geometrically from 2 pi patches towards BASE times that."""
+"""Wave lengths rise geometrically from 2 pi patches to ROPE_BASE times that."""
 QueriesKeysValues = tuple[Tensor, Tensor, Tensor]
 """Each (B, N, heads, channels)."""
 
 
 class Rope(NamedTuple):
-    """Cosine and sine (N, 1, HEAD_SIZE) of the angles of N tokens, the sine with its sign."""
+    """Two-dimensional rotary position embedding of N tokens.
+
+    ``cos`` and ``sin`` (N, 1, HEAD_DIM) of the rotation angles; ``sin`` carries its sign. The
+    first half of a head's channels rotates with the row, the second with the column; within a
+    half, channel j is paired with channel j + HEAD_DIM / 4 ("rotate half").
+    """
 
     cos: Tensor
     sin: Tensor
 
-    def turn(self, x: Tensor) -> Tensor:
-        """Turn queries or keys x (..., N, heads, HEAD_SIZE)."""
+    def apply(self, x: Tensor) -> Tensor:
+        """Rotate queries or keys x (..., N, heads, HEAD_DIM)."""
         partner = x.unflatten(-1, (2, 2, -1)).flip(-2).flatten(-3)
         return torch.addcmul(x * self.cos, partner, self.sin)
 
     def repeat(self, frames: int) -> Rope:
-        """Return the table of several frames one after the other: they share their places."""
+        """Return the embedding of several frames one after the other, at equal positions."""
         return Rope(self.cos.repeat(frames, 1, 1), self.sin.repeat(frames, 1, 1))
 
 
 def make_rope(rows: int, columns: int, like: Tensor) -> Rope:
-    """Return the table of one frame's tokens, in the type and on the device of `like`.
+    """Return the embedding of one frame's tokens, with the dtype and device of `like`.
 
-    Special tokens come first and stand at (0, 0), which turns nothing; patches count from 1.
+    Prefix tokens are at (0, 0), where the rotation is the identity; patches count from 1.
     """
     row, column = torch.meshgrid(
         torch.arange(1, rows + 1, device=like.device),
         torch.arange(1, columns + 1, device=like.device), indexing='ij')
-    places = torch.stack([row.flatten(), column.flatten()], dim=1).to(like.dtype)
-    places = torch.cat([places.new_zeros(SPECIAL, 2), places])
-    quarter = HEAD_SIZE // 4
+    positions = torch.stack([row.flatten(), column.flatten()], dim=1).to(like.dtype)
+    positions = torch.cat([positions.new_zeros(NUM_PREFIX_TOKENS, 2), positions])
+    quarter = HEAD_DIM // 4
     exponents = torch.arange(quarter, device=like.device, dtype=like.dtype) / quarter
-    angles = places[:, :, None] * ROPE_BASE ** -exponents
+    angles = positions[:, :, None] * ROPE_BASE ** -exponents
     cos, sin = angles.cos(), angles.sin()
     return Rope(torch.stack([cos, cos], dim=2).flatten(1)[:, None],
                 torch.stack([-sin, sin], dim=2).flatten(1)[:, None])
 
 
 class Linear(nn.Linear):
-    """x (..., in) to (..., out)."""
+    """Linear layer: x (..., in) to (..., out)."""
 
     def forward(self, x: Tensor) -> Tensor:
-        """Multiply in the type of the weights."""
+        """Multiply in the dtype of the weights."""
         return functional.linear(x.to(self.weight.dtype), self.weight, self.bias)
 
-    def rows(self, x: Tensor, first: int, last: int | None) -> Tensor:
-        """Return only some of the outputs."""
+    def forward_slice(self, x: Tensor, first: int, last: int | None) -> Tensor:
+        """Return outputs [first, last) only."""
         weight, bias = self.weight[first:last], self.bias[first:last]
         return functional.linear(x.to(weight.dtype), weight, bias)
 
 
 class LayerNorm(nn.LayerNorm):
-    """Normalises the last dimension."""
+    """Layer norm of the last dimension."""
 
     def forward(self, x: Tensor) -> Tensor:
-        """Normalise in the type of the weights."""
+        """Normalise in the dtype of the weights."""
         return super().forward(x.to(self.weight.dtype))
 
 
 class LayerScale(nn.Module):
-    """One factor per channel on what a branch adds to the residual stream."""
+    """Factor per channel of a residual branch."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -90,7 +96,7 @@ class LayerScale(nn.Module):
 
 
 class Mlp(nn.Module):
-    """Two linear layers around an exact GELU."""
+    """Two linear layers with an exact GELU in between."""
 
     def __init__(self, width: int, hidden: int, out: int) -> None:
         super().__init__()
@@ -103,7 +109,7 @@ class Mlp(nn.Module):
 
 
 class Attention(nn.Module):
-    """Multi-head attention, with queries and keys normalised per head where `qk_norm`."""
+    """Multi-head attention; with `qk_norm`, queries and keys are normalised per head."""
 
     def __init__(self, width: int, heads: int, qk_norm: bool) -> None:
         super().__init__()
@@ -113,37 +119,40 @@ class Attention(nn.Module):
         self.k_norm = LayerNorm(self.channels) if qk_norm else nn.Identity()
         self.proj = Linear(width, width)
 
-    def project(self, x: Tensor, rotary: Rope | None) -> QueriesKeysValues:
-        """Return what tokens x (B, N, width) ask, answer to, and tell."""
+    def project(self, x: Tensor, rope: Rope | None) -> QueriesKeysValues:
+        """Return queries, keys and values of tokens x (B, N, width)."""
         q, k, v = self._split(self.qkv(x))
         q, k = self.q_norm(q), self.k_norm(k)
-        if rotary is not None:
-            q, k = rotary.turn(q), rotary.turn(k)
+        if rope is not None:
+            q, k = rope.apply(q), rope.apply(k)
         return q.to(v.dtype), k.to(v.dtype), v
 
-    def project_special(self, special: Tensor, x: Tensor, rotary: Rope) -> QueriesKeysValues:
-        """Return the same, but ask only for special tokens (B, M, width), which are not turned."""
+    def project_subset(self, subset: Tensor, x: Tensor, rope: Rope) -> QueriesKeysValues:
+        """Return queries of a subset (B, M, width) of x, and keys and values of all of x.
+
+        The subset holds prefix tokens, which `rope` does not rotate.
+        """
         width = x.shape[-1]
-        (q,) = self._split(self.qkv.rows(special, 0, width))
-        k, v = self._split(self.qkv.rows(x, width, None))
-        return self.q_norm(q).to(v.dtype), rotary.turn(self.k_norm(k)).to(v.dtype), v
+        (q,) = self._split(self.qkv.forward_slice(subset, 0, width))
+        k, v = self._split(self.qkv.forward_slice(x, width, None))
+        return self.q_norm(q).to(v.dtype), rope.apply(self.k_norm(k)).to(v.dtype), v
 
     def forward(self, q: Tensor, k: Tensor, v: Tensor) -> Tensor:
-        """Return the answers to the queries, (B, N, width)."""
-        answers = functional.scaled_dot_product_attention(
+        """Return the attention output of the queries, (B, N, width)."""
+        output = functional.scaled_dot_product_attention(
             q.transpose(1, 2), k.transpose(1, 2), v.transpose(1, 2))
-        return self.proj(answers.transpose(1, 2).flatten(2))
+        return self.proj(output.transpose(1, 2).flatten(2))
 
     def _split(self, x: Tensor) -> tuple[Tensor, ...]:
-        """Cut (B, N, parts x width) into parts (B, N, heads, channels)."""
+        """Split (B, N, parts x width) into parts (B, N, heads, channels)."""
         return x.unflatten(-1, (-1, self.heads, self.channels)).unbind(2)
 
 
 class Block(nn.Module):
-    """Attention and MLP, each normalised before and scaled after, on a residual stream.
+    """Pre-norm attention and MLP with layer scale on a residual stream.
 
-    `forward` is two steps, `project` and `complete`: a window that slides knows the outcome of
-    the first one already for most of its frames.
+    `forward` is `project` followed by `complete`: a sliding window caches the outcome of the
+    first step for most of its frames.
     """
 
     def __init__(self, width: int, heads: int, eps: float = 1e-5, qk_norm: bool = False) -> None:
@@ -155,20 +164,20 @@ class Block(nn.Module):
         self.mlp = Mlp(width, 4 * width, width)
         self.ls2 = LayerScale(width)
 
-    def forward(self, x: Tensor, rotary: Rope | None = None) -> Tensor:
+    def forward(self, x: Tensor, rope: Rope | None = None) -> Tensor:
         """Return tokens (B, N, width) after the block."""
-        return self.complete(x, *self.project(x, rotary))
+        return self.complete(x, *self.project(x, rope))
 
-    def project(self, x: Tensor, rotary: Rope | None = None) -> QueriesKeysValues:
+    def project(self, x: Tensor, rope: Rope | None = None) -> QueriesKeysValues:
         """Return queries, keys and values of tokens x (B, N, width)."""
-        return self.attn.project(self.norm1(x), rotary)
+        return self.attn.project(self.norm1(x), rope)
 
     def complete(self, x: Tensor, q: Tensor, k: Tensor, v: Tensor) -> Tensor:
-        """Return tokens x (B, N, width) after attention and MLP; k and v may be of more."""
+        """Return tokens x (B, N, width) after attention and MLP; k and v may have more tokens."""
         x = x + self.ls1(self.attn(q, k, v))
         return x + self.ls2(self.mlp(self.norm2(x)))
 
-    def special(self, special: Tensor, x: Tensor, rotary: Rope) -> Tensor:
-        """Return only special tokens (B, M, width) out of tokens x (B, N, width)."""
-        return self.complete(special, *self.attn.project_special(
-            self.norm1(special), self.norm1(x), rotary))
+    def forward_subset(self, subset: Tensor, x: Tensor, rope: Rope) -> Tensor:
+        """Return only a subset (B, M, width) of tokens x (B, N, width): prefix tokens."""
+        return self.complete(subset, *self.attn.project_subset(
+            self.norm1(subset), self.norm1(x), rope))

@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The part of VGGT that poses need: 1.125 of 1.257 billion parameters."""
+"""VGGT without its heads for depth, points and tracks: 1.125 of 1.257 billion parameters."""
 
 from __future__ import annotations
 
@@ -10,14 +10,13 @@ from torch import Tensor, nn
 from kfvo_ros.backbones.vggt.aggregator import Aggregator
 from kfvo_ros.backbones.vggt.camera_head import CameraHead
 from kfvo_ros.backbones.vggt.config import VggtConfig
-from kfvo_ros.backbones.vggt.layers import LayerNorm, LayerScale
-from kfvo_ros.backbones.vggt.runtime import set_precision
+from kfvo_ros.backbones.vggt.layers import LayerNorm, LayerScale, Linear
 
 
 class Vggt(nn.Module):
     """Visual geometry grounded transformer: images of a window to poses and fields of view.
 
-    Parameters are called as in the published checkpoints. Source: Wang et al., VGGT: Visual
+    Parameters have the names of the published checkpoints. Source: Wang et al., VGGT: Visual
     Geometry Grounded Transformer, CVPR 2025.
     """
 
@@ -32,9 +31,21 @@ class Vggt(nn.Module):
         return self.camera_head(self.aggregator(images))
 
 
+def set_precision(model: Vggt, dtype: torch.dtype) -> Vggt:
+    """Store the aggregator's matrices in `dtype` and return the model.
+
+    Norms, scales, tokens, position embedding and the whole camera head keep theirs: see `layers`
+    for the consequences.
+    """
+    for module in model.aggregator.modules():
+        if isinstance(module, Linear | nn.Conv2d):
+            module.to(dtype)
+    return model
+
+
 def random_model(device: torch.device, dtype: torch.dtype,
                  config: VggtConfig | None = None) -> Vggt:
-    """Return a model of random weights, made on `device` without a second copy."""
+    """Return a model of random weights, created on `device` without a second copy."""
     with torch.device('meta'):
         model = set_precision(Vggt(config), dtype)
     model = model.to_empty(device=device)

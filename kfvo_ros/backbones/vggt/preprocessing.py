@@ -1,6 +1,9 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Images as the model was trained on: a fixed width, whole patches, Pillow's bicubic filter."""
+"""Images in the size that the model expects: the official loader's ``crop`` mode.
+
+A fixed width, whole patches, Pillow's bicubic filter.
+"""
 
 from __future__ import annotations
 
@@ -9,25 +12,26 @@ from dataclasses import dataclass
 import numpy as np
 from PIL import Image
 
-from kfvo_ros.backbones.vggt.config import PATCH
+from kfvo_ros.backbones.vggt.config import PATCH_SIZE
 from kfvo_ros.errors import KfvoError
 
-MOST_HIGH = 16
-"""What is higher is no picture, and would be made enormous before it is cut."""
+MAX_HEIGHT_TO_WIDTH = 16
+"""Higher images would be resized to an enormous height before they are cropped."""
 
 
 @dataclass(frozen=True)
-class Fit:
-    """How images of one size are brought to the model's, by the official loader's ``crop`` rule.
+class ImageFit:
+    """Resize and crop of images of one native size.
 
-    Resized to (``height``, ``width``), then the middle ``rows`` are kept, from ``first`` on.
+    An image is resized to (``height``, ``width``), then cropped to the middle ``rows``, starting
+    at ``first_row``.
     """
 
     native_height: int
     native_width: int
     height: int
     width: int
-    first: int
+    first_row: int
     rows: int
 
     def apply(self, image: np.ndarray) -> np.ndarray:
@@ -35,29 +39,30 @@ class Fit:
         colour = image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
         resized = Image.fromarray(colour).resize((self.width, self.height),
                                                  Image.Resampling.BICUBIC)
-        return np.asarray(resized)[self.first:self.first + self.rows]
+        return np.asarray(resized)[self.first_row:self.first_row + self.rows]
 
-    def native(self, K: np.ndarray) -> np.ndarray:
+    def native_intrinsics(self, K: np.ndarray) -> np.ndarray:
         """Return intrinsics (..., 3, 3) of the native image for those of the fitted one."""
+        scale_x, scale_y = self.native_width / self.width, self.native_height / self.height
         to_native = np.array([
-            [self.native_width / self.width, 0.0, 0.0],
-            [0.0, self.native_height / self.height, self.first * self.native_height / self.height],
+            [scale_x, 0.0, 0.0],
+            [0.0, scale_y, self.first_row * self.native_height / self.height],
             [0.0, 0.0, 1.0]])
         return to_native @ K
 
 
-def fit(native_height: int, native_width: int, width: int) -> Fit:
-    """Return how images of one size are brought to `width`, a multiple of PATCH [px].
+def fit_image(native_height: int, native_width: int, width: int) -> ImageFit:
+    """Return the fit of images of one size to `width`, a multiple of PATCH_SIZE [px].
 
-    The height is rounded to whole patches; what is higher than wide is cut to a square. Raises
-    KfvoError when not one row of patches is left, and for what is far higher than wide.
+    The height is rounded to whole patches; images higher than wide are cropped to a square.
+    Raises KfvoError where less than one row of patches remains, and for extremely high images.
     """
-    if native_height > MOST_HIGH * native_width:
-        raise KfvoError(f'expected images at most {MOST_HIGH} times as high as wide; '
+    if native_height > MAX_HEIGHT_TO_WIDTH * native_width:
+        raise KfvoError(f'expected images at most {MAX_HEIGHT_TO_WIDTH} times as high as wide; '
                         f'{native_width}x{native_height} came')
-    height = round(native_height * (width / native_width) / PATCH) * PATCH
+    height = round(native_height * (width / native_width) / PATCH_SIZE) * PATCH_SIZE
     if height == 0:
-        raise KfvoError(f'expected images at least {PATCH} pixels high when {width} wide; '
+        raise KfvoError(f'expected images at least {PATCH_SIZE} pixels high when {width} wide; '
                         f'{native_width}x{native_height} came')
     rows = min(height, width)
-    return Fit(native_height, native_width, height, width, (height - rows) // 2, rows)
+    return ImageFit(native_height, native_width, height, width, (height - rows) // 2, rows)

@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Where the model runs, and in which numbers."""
+"""Execution of the model: device, dtype, compiled blocks, weight layout, memory errors, timing."""
 
 from __future__ import annotations
 
@@ -10,24 +10,22 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from kfvo_ros.backbones.vggt.layers import Block, Linear
+from kfvo_ros.backbones.vggt.model import Vggt
 from kfvo_ros.errors import KfvoError, MemoryFullError
-
-if TYPE_CHECKING:
-    from kfvo_ros.backbones.vggt.model import Vggt
 
 PRECISIONS = {'fp32': torch.float32, 'bf16': torch.bfloat16, 'fp16': torch.float16}
 BFLOAT16_FLAGS = ('avx512_bf16', 'amx_bf16', 'bf16')
-"""What Linux calls bfloat16 arithmetic on x86-64 (two kinds) and on ARM."""
+"""Linux's names of bfloat16 arithmetic on x86-64 (two kinds) and on ARM."""
 AMPERE = (8, 0)
-"""The first compute capability with bfloat16."""
-NO_MEMORY = ("can't allocate memory", 'could not create a')
-"""What torch and its oneDNN say where the processor's memory ends; it has no type of its own."""
+"""First CUDA compute capability with bfloat16."""
+OUT_OF_MEMORY_MESSAGES = ("can't allocate memory", 'could not create a')
+"""In the RuntimeError of torch or its oneDNN when the CPU's memory is full."""
 
 
 def choose_device(name: str) -> torch.device:
@@ -50,7 +48,7 @@ def choose_device(name: str) -> torch.device:
 
 
 def choose_dtype(precision: str, device: torch.device) -> torch.dtype:
-    """Return the type of the aggregator's matrices; ``auto`` is what the device does fast."""
+    """Return the dtype of the aggregator's matrices; ``auto`` is the device's fastest."""
     if precision != 'auto':
         return PRECISIONS[precision]
     if device.type == 'cuda':
@@ -59,29 +57,19 @@ def choose_dtype(precision: str, device: torch.device) -> torch.dtype:
     return torch.bfloat16 if _cpu_has_bfloat16() else torch.float32
 
 
-def set_precision(model: Vggt, dtype: torch.dtype) -> Vggt:
-    """Store the aggregator's matrices in `dtype` and return the model.
-
-    Norms, scales, tokens, the table of places and the whole camera head stay as they are: see
-    `layers` for what follows from that.
-    """
-    for module in model.aggregator.modules():
-        if isinstance(module, Linear | nn.Conv2d):
-            module.to(dtype)
-    return model
-
-
 def _cpu_has_bfloat16() -> bool:
-    about = Path('/proc/cpuinfo')
-    words = set(about.read_text(encoding='utf-8').split()) if about.exists() else set()
+    path = Path('/proc/cpuinfo')
+    words = set(path.read_text(encoding='utf-8').split()) if path.exists() else set()
     return any(flag in words for flag in BFLOAT16_FLAGS)
 
 
 def compile_blocks(model: Vggt) -> Vggt:
-    """Have the blocks compiled when they are first called, and return the model.
+    """Compile the blocks at their first call; return the model.
 
-    Blocks are alike, so a few compilations serve all of them, and sizes are symbols: other
-    images and longer windows need none.
+    Compilation fuses the elementwise work between the matrix products (norms, rotations, casts,
+    scales, sums), which is bound by memory. Equal blocks share a few compilations, and sizes are
+    symbolic: other images and longer windows need no new one. CUDA graphs are not used: cached
+    tokens would have to be copied out of a graph's own memory.
     """
     for block in model.modules():
         if isinstance(block, Block):
@@ -90,9 +78,9 @@ def compile_blocks(model: Vggt) -> Vggt:
 
 
 @contextmanager
-def compiler_needed() -> Iterator[None]:
-    """Turn what torch could not compile into a KfvoError."""
-    # Not above: the compiler takes two seconds to import.
+def compile_errors() -> Iterator[None]:
+    """Convert torch's compilation errors into a KfvoError."""
+    # Imported here: the compiler takes two seconds to import.
     from torch._dynamo.exc import TorchDynamoException
     try:
         yield
@@ -103,7 +91,7 @@ def compiler_needed() -> Iterator[None]:
 
 
 class OneDnnLinear(nn.Module):
-    """A Linear whose weights oneDNN has laid out for itself, as torch's own compiler does it."""
+    """Linear with weights in oneDNN's own layout, by the operators of torch's compiler."""
 
     def __init__(self, linear: Linear) -> None:
         super().__init__()
@@ -112,39 +100,39 @@ class OneDnnLinear(nn.Module):
         self._bias = linear.bias
 
     def forward(self, x: Tensor) -> Tensor:
-        """Multiply in the type of the weights."""
+        """Multiply in the dtype of the weights."""
         return torch.ops.mkldnn._linear_pointwise(x.to(self._dtype), self._weight, self._bias,
                                                   'none', [], '')
 
 
 def use_onednn_layout(model: Vggt) -> Vggt:
-    """Lay out the matrices of a model on the CPU and return it; a matrix at a time is copied.
+    """Convert the matrices of a model on the CPU to oneDNN's layout, one at a time; return it.
 
-    Where torch has no oneDNN, or not these operators, nothing changes.
+    Without oneDNN, or these operators, in torch the model is unchanged.
     """
     last = model.aggregator.global_blocks[-1]
     assert isinstance(last, Block)
     try:
         OneDnnLinear(last.attn.proj)(torch.zeros(1, model.config.width))
     except (AttributeError, RuntimeError) as error:
-        logging.getLogger(__name__).info('weights are not packed: %s', error)
+        logging.getLogger(__name__).info('weights keep their layout: %s', error)
         return model
-    # No list of the matrices themselves: it would keep every one that was laid out anew.
+    # The list holds no matrices: it would keep the replaced ones alive.
     for module in [each for each in model.modules() if not isinstance(each, Linear)]:
         for name, child in module.named_children():
-            if isinstance(child, Linear) and child is not last.attn.qkv:  # used in parts
+            if isinstance(child, Linear) and child is not last.attn.qkv:  # used in slices
                 setattr(module, name, OneDnnLinear(child))
     return model
 
 
 @contextmanager
-def memory_bounded(device: torch.device) -> Iterator[None]:
-    """Turn an allocation that failed into a MemoryFullError with the remedies."""
+def memory_errors(device: torch.device) -> Iterator[None]:
+    """Convert failed allocations into a MemoryFullError that names the remedies."""
     try:
         yield
     except (torch.OutOfMemoryError, MemoryError, RuntimeError) as error:
         known = isinstance(error, torch.OutOfMemoryError | MemoryError)
-        if not known and not any(words in str(error) for words in NO_MEMORY):
+        if not known and not any(text in str(error) for text in OUT_OF_MEMORY_MESSAGES):
             raise
         if device.type == 'cuda':
             torch.cuda.empty_cache()
@@ -152,17 +140,17 @@ def memory_bounded(device: torch.device) -> Iterator[None]:
                               'smaller, or set precision to bf16') from error
 
 
-class DeviceTime:
-    """``with DeviceTime(device) as part: ...``; ``part.seconds`` once the results were fetched.
+class DeviceTimer:
+    """Time a device takes for a block: ``with DeviceTimer(device) as timer: ...``.
 
-    A GPU works after the call has returned: two events go with its work instead of a wait for
-    it. Asked before the device has come to the second event, torch raises RuntimeError.
+    A GPU works asynchronously: two events in its queue replace a synchronisation. Read
+    ``timer.seconds`` after fetching the results; torch raises RuntimeError before that.
     """
 
     def __init__(self, device: torch.device) -> None:
         self._device = device
 
-    def __enter__(self) -> DeviceTime:
+    def __enter__(self) -> DeviceTimer:
         self._begin = self._mark()
         return self
 
@@ -172,13 +160,13 @@ class DeviceTime:
 
     @property
     def seconds(self) -> float:
-        """The time [s] between begin and end."""
+        """Time between begin and end [s]."""
         if self._device.type != 'cuda':
             return self._end - self._begin
         return 1e-3 * self._begin.elapsed_time(self._end)
 
     def _mark(self) -> Any:
-        """Return the time [s], or an event that stands for it."""
+        """Return the time [s], or for a GPU an event in its queue."""
         if self._device.type != 'cuda':
             return time.perf_counter()
         event = torch.cuda.Event(enable_timing=True)

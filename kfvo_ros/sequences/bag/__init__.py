@@ -1,3 +1,3 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Bags of ROS 1 and ROS 2, read and written without ROS."""
+"""ROS 1 and ROS 2 bags, read and written without a ROS installation."""

@@ -1,11 +1,10 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Arrays to messages of ROS 2, in the dataclasses of rosbags."""
+"""Conversion of arrays to ROS 2 messages, as the dataclasses of rosbags."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from typing import Any
+from collections.abc import Iterable
 
 import cv2
 import numpy as np
@@ -14,21 +13,15 @@ from rosbags.typesys.stores import ros2_jazzy as ros
 from kfvo_ros import geometry
 from kfvo_ros.camera import Camera
 from kfvo_ros.errors import KfvoError
-from kfvo_ros.sequences.base import FixedTransform, GroundTruth
+from kfvo_ros.sequences.base import FixedTransform
 from kfvo_ros.trajectory import NANOSECONDS, UNKNOWN_VARIANCE, format_stamp
 
 END_NS = 2 ** 31 * NANOSECONDS
-"""The seconds of a ROS stamp have 31 bits: they end in 2038."""
-ODOMETRY_TOPIC = '/ground_truth/odometry'
-POINT_TOPIC = '/ground_truth/position'
-WORLD = 'world'
-"""The frame in which ground truth is given."""
-CODECS = ('png', 'jpeg')
-"""Compressions of images by the name that ROS gives them; the first loses nothing."""
+"""End of ROS time: its seconds have 31 bits, so they end in 2038."""
 
 
 def header_of(stamp_ns: int, frame_id: str) -> ros.std_msgs__msg__Header:
-    """Return a std_msgs/Header; raises KfvoError for a time that ROS cannot express."""
+    """Return a std_msgs/Header; raises KfvoError for a stamp that ROS cannot represent."""
     if not 0 <= stamp_ns < END_NS:
         raise KfvoError('expected a time of 1970 to 2038, the only ones of ROS; came '
                         f'{format_stamp(stamp_ns)} s')
@@ -38,7 +31,7 @@ def header_of(stamp_ns: int, frame_id: str) -> ros.std_msgs__msg__Header:
 
 
 def image_message(stamp_ns: int, frame_id: str, image: np.ndarray) -> ros.sensor_msgs__msg__Image:
-    """Return a sensor_msgs/Image, mono8 of (H, W) uint8 or rgb8 of (H, W, 3)."""
+    """Return a sensor_msgs/Image: mono8 of (H, W) uint8, rgb8 of (H, W, 3)."""
     height, width = image.shape[:2]
     return ros.sensor_msgs__msg__Image(
         header_of(stamp_ns, frame_id), height=height, width=width, encoding=_encoding(image),
@@ -47,17 +40,18 @@ def image_message(stamp_ns: int, frame_id: str, image: np.ndarray) -> ros.sensor
 
 def compressed_message(stamp_ns: int, frame_id: str, image: np.ndarray, codec: str
                        ) -> ros.sensor_msgs__msg__CompressedImage:
-    """Return a sensor_msgs/CompressedImage as image_transport writes it, JPEG of quality 95.
+    """Return a sensor_msgs/CompressedImage in image_transport's format; JPEG has quality 95.
 
-    Raises KfvoError for an image that one of the CODECS cannot hold.
+    `codec` is one of `kfvo_ros.images.CODECS`. Raises KfvoError for an image that cannot be
+    encoded.
     """
     is_grey = image.ndim == 2
     bgr = image if is_grey else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
     try:
-        done, data = cv2.imencode(f'.{codec}', bgr)
+        encoded, data = cv2.imencode(f'.{codec}', bgr)
     except cv2.error:
-        done = False
-    if not done:
+        encoded = False
+    if not encoded:
         raise KfvoError(f'OpenCV cannot compress an image of {image.shape[1]}x{image.shape[0]} '
                         f'to {codec}; write it raw')
     return ros.sensor_msgs__msg__CompressedImage(
@@ -67,7 +61,7 @@ def compressed_message(stamp_ns: int, frame_id: str, image: np.ndarray, codec: s
 
 def camera_info_message(stamp_ns: int, frame_id: str, camera: Camera
                         ) -> ros.sensor_msgs__msg__CameraInfo:
-    """Return a sensor_msgs/CameraInfo: one camera, whose P is its K."""
+    """Return a sensor_msgs/CameraInfo of a monocular camera: R = I, P = [K 0]."""
     model, coefficients = camera.ros_distortion
     region = ros.sensor_msgs__msg__RegionOfInterest(0, 0, 0, 0, do_rectify=False)
     return ros.sensor_msgs__msg__CameraInfo(
@@ -76,28 +70,30 @@ def camera_info_message(stamp_ns: int, frame_id: str, camera: Camera
         r=np.eye(3).ravel(), p=camera.projection.ravel(), binning_x=0, binning_y=0, roi=region)
 
 
-def odometry_message(stamp_ns: int, world: str, frame_id: str, pose: np.ndarray
-                     ) -> ros.nav_msgs__msg__Odometry:
-    """Return a nav_msgs/Odometry of T_world_frame (4, 4), whose velocity is unknown."""
+def odometry_message(stamp_ns: int, world_frame: str, child_frame: str,
+                     T_world_child: np.ndarray) -> ros.nav_msgs__msg__Odometry:
+    """Return a nav_msgs/Odometry of T_world_child (4, 4), whose velocity is unknown."""
     zero = ros.geometry_msgs__msg__Vector3(0.0, 0.0, 0.0)
     return ros.nav_msgs__msg__Odometry(
-        header_of(stamp_ns, world), child_frame_id=frame_id,
+        header_of(stamp_ns, world_frame), child_frame_id=child_frame,
         pose=ros.geometry_msgs__msg__PoseWithCovariance(
-            ros.geometry_msgs__msg__Pose(_point(pose), _quaternion(pose)), np.zeros(36)),
+            ros.geometry_msgs__msg__Pose(_point(T_world_child), _quaternion(T_world_child)),
+            np.zeros(36)),
         twist=ros.geometry_msgs__msg__TwistWithCovariance(
             ros.geometry_msgs__msg__Twist(linear=zero, angular=zero),
             (UNKNOWN_VARIANCE * np.eye(6)).ravel()))
 
 
-def point_message(stamp_ns: int, world: str, pose: np.ndarray
+def point_message(stamp_ns: int, world_frame: str, T_world_point: np.ndarray
                   ) -> ros.geometry_msgs__msg__PointStamped:
     """Return a geometry_msgs/PointStamped of the position in T_world_point (4, 4)."""
-    return ros.geometry_msgs__msg__PointStamped(header_of(stamp_ns, world), _point(pose))
+    return ros.geometry_msgs__msg__PointStamped(header_of(stamp_ns, world_frame),
+                                                _point(T_world_point))
 
 
 def static_transforms_message(stamp_ns: int, transforms: Iterable[FixedTransform]
                               ) -> ros.tf2_msgs__msg__TFMessage:
-    """Return a tf2_msgs/TFMessage."""
+    """Return a tf2_msgs/TFMessage of fixed transforms, all with one stamp."""
     return ros.tf2_msgs__msg__TFMessage([
         ros.geometry_msgs__msg__TransformStamped(
             header_of(stamp_ns, fixed.parent), child_frame_id=fixed.child,
@@ -118,42 +114,3 @@ def _point(pose: np.ndarray) -> ros.geometry_msgs__msg__Point:
 def _quaternion(pose: np.ndarray) -> ros.geometry_msgs__msg__Quaternion:
     quat_xyzw = geometry.quat_xyzw_from_rotation(pose[:3, :3])
     return ros.geometry_msgs__msg__Quaternion(*map(float, quat_xyzw))
-
-
-class TruthMessages:
-    """Hands out ground truth as Odometry, or as PointStamped where it has no rotations.
-
-    Truth at the camera has `camera_frame` for its child frame, so that nothing needs to be
-    moved to read it back. A measured frame that is only known by its topic keeps the topic.
-    Raises KfvoError for times that ROS cannot express.
-    """
-
-    def __init__(self, truth: GroundTruth, camera_frame: str) -> None:
-        order = np.argsort(truth.trajectory.stamps_ns, kind='stable')
-        self._trajectory = truth.trajectory.select(order)
-        self._given = 0
-        is_topic = truth.frame.startswith('/')
-        own_topic = ODOMETRY_TOPIC if self._trajectory.has_rotation else POINT_TOPIC
-        self.topic = truth.frame if is_topic else own_topic
-        frame = camera_frame if truth.frame == 'camera' else truth.frame
-        self._frame = '' if is_topic else frame
-        for extreme_ns in (*self._trajectory.stamps_ns[:1], *self._trajectory.stamps_ns[-1:]):
-            header_of(int(extreme_ns), WORLD)
-
-    def first_ns(self, other_ns: int) -> int:
-        """Return the earlier of the first stamp and another."""
-        return min([other_ns, *self._trajectory.stamps_ns[:1].tolist()])
-
-    def until(self, end_ns: int | None) -> Iterator[tuple[int, Any]]:
-        """Yield (stamp_ns, message) of what was not handed out yet, up to `end_ns`; None: all."""
-        stamps_ns = self._trajectory.stamps_ns
-        end = len(stamps_ns) if end_ns is None else np.searchsorted(stamps_ns, end_ns, 'right')
-        for index in range(self._given, int(end)):
-            self._given = index + 1
-            yield int(stamps_ns[index]), self._message(index)
-
-    def _message(self, index: int) -> Any:
-        stamp_ns, pose = int(self._trajectory.stamps_ns[index]), self._trajectory.poses[index]
-        if self._trajectory.has_rotation:
-            return odometry_message(stamp_ns, WORLD, self._frame, pose)
-        return point_message(stamp_ns, WORLD, pose)

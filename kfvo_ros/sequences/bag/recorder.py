@@ -1,37 +1,46 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A sequence as a robot would have recorded it: images, CameraInfo, ground truth, /tf_static."""
+"""Recording of a sequence to a bag: images, CameraInfo, ground truth and /tf_static."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from typing import Any
+
+import numpy as np
 
 from kfvo_ros.camera import write_camera_info
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.sequences.bag.camera import camera_info_topic, is_rectified
 from kfvo_ros.sequences.bag.messages import (
-    TruthMessages,
     camera_info_message,
     compressed_message,
+    header_of,
     image_message,
+    odometry_message,
+    point_message,
     static_transforms_message,
 )
 from kfvo_ros.sequences.bag.writer import LATCHED, BagWriter
-from kfvo_ros.sequences.base import CALIBRATION_FILE, Frame, Sequence
+from kfvo_ros.sequences.base import CALIBRATION_FILE, Frame, GroundTruth, Sequence
 from kfvo_ros.trajectory import ASSOCIATION_LIMIT_NS
 
 STATIC_TOPIC = '/tf_static'
+ODOMETRY_TOPIC = '/ground_truth/odometry'
+POINT_TOPIC = '/ground_truth/position'
+WORLD_FRAME = 'world'
+"""The frame of ground truth poses."""
 _TOPIC = re.compile(r'(?!.*__)(/[A-Za-z_][A-Za-z0-9_]*)+')
 
 
 class Recorder:
     """Writes the frames of a sequence and, in time order between them, its ground truth.
 
-    Images go to `topic`, by default the sequence's own, with ``/compressed`` behind it when a
-    `codec` compresses them. CameraInfo goes beside them, unless ``camera`` is None: nobody knows
-    it, or it was guessed, and a guess must not be taken for a calibration. Raises KfvoError for
-    topics that cannot be.
+    Images go to `topic`, by default the sequence's own, with ``/compressed`` appended when a
+    `codec` compresses them. CameraInfo goes beside them, except for an unknown or guessed
+    camera: ``camera`` is then None, because a reader would take a guess for a calibration.
+    Raises KfvoError for invalid or conflicting topics and for ground truth outside ROS time.
     """
 
     def __init__(self, sequence: Sequence, writer: BagWriter, topic: str | None = None,
@@ -42,23 +51,22 @@ class Recorder:
         self._writer, self._codec = writer, codec
         self._camera_frame = sequence.camera_frame
         self._transforms = sequence.extrinsics()
-        truth = sequence.ground_truth()
-        self._truth = None if truth is None else TruthMessages(truth, self._camera_frame)
-        base = _valid_topic(topic or sequence.topic)
-        self._image_topic = f'{base}/compressed' if codec else base
-        self._info_topic = camera_info_topic(base)
-        self._refuse_what_misleads(base)
+        ground_truth = sequence.ground_truth()
+        self._ground_truth = None if ground_truth is None else \
+            GroundTruthMessages(ground_truth, self._camera_frame)
+        raw_topic = _valid_topic(topic or sequence.topic)
+        self._image_topic = f'{raw_topic}/compressed' if codec else raw_topic
+        self._info_topic = camera_info_topic(raw_topic)
+        self._check_topic(raw_topic)
         self._last_ns = 0
 
     def write(self, frame: Frame) -> None:
-        """Append a frame, and the ground truth before it."""
+        """Append a frame and the ground truth up to its stamp; raises KfvoError."""
         stamp_ns = frame.stamp_ns
-        image = self._image_message(frame)  # it may be impossible, so before all that is written
+        image = self._image_message(frame)  # first, because it may raise
         if self.frame_count == 0 and self._transforms:
-            start_ns = stamp_ns if self._truth is None else self._truth.first_ns(stamp_ns)
-            self._writer.write(STATIC_TOPIC, start_ns,
-                               static_transforms_message(start_ns, self._transforms), LATCHED)
-        self._write_truth(stamp_ns)
+            self._write_transforms(stamp_ns)
+        self._write_ground_truth(stamp_ns)
         if self.camera is not None:
             info = camera_info_message(stamp_ns, self._camera_frame, self.camera)
             self._writer.write(self._info_topic, stamp_ns, info)
@@ -67,11 +75,11 @@ class Recorder:
         self._last_ns = stamp_ns
 
     def finish(self, complete: bool) -> None:
-        """Close the bag, with all ground truth if `complete`, else with the last frame's."""
-        self._write_truth(None if complete else self._last_ns + ASSOCIATION_LIMIT_NS)
+        """Close the bag; unless `complete`, omit the ground truth after the last frame."""
+        self._write_ground_truth(None if complete else self._last_ns + ASSOCIATION_LIMIT_NS)
         self._writer.close()
         if self.camera is not None and self.camera.readout_s > 0.0:
-            # CameraInfo has no field for it; the file beside a bag's images is read with them.
+            # CameraInfo has no field for the readout time; `BagSequence` reads this file.
             write_camera_info(self._writer.path / CALIBRATION_FILE, self.camera)
 
     def _image_message(self, frame: Frame) -> Any:
@@ -79,23 +87,71 @@ class Recorder:
             return image_message(frame.stamp_ns, self._camera_frame, frame.image)
         return compressed_message(frame.stamp_ns, self._camera_frame, frame.image, self._codec)
 
-    def _write_truth(self, end_ns: int | None) -> None:
-        if self._truth is not None:
-            for stamp_ns, message in self._truth.until(end_ns):
-                self._writer.write(self._truth.topic, stamp_ns, message)
+    def _write_transforms(self, first_ns: int) -> None:
+        if self._ground_truth is not None:
+            first_ns = self._ground_truth.earliest_ns(first_ns)
+        self._writer.write(STATIC_TOPIC, first_ns,
+                           static_transforms_message(first_ns, self._transforms), LATCHED)
 
-    def _refuse_what_misleads(self, base: str) -> None:
-        """Raise KfvoError for a topic that is taken, or that promises what its images are not."""
-        others = {self._info_topic, STATIC_TOPIC} | ({self._truth.topic} if self._truth else set())
+    def _write_ground_truth(self, end_ns: int | None) -> None:
+        if self._ground_truth is not None:
+            for stamp_ns, message in self._ground_truth.until(end_ns):
+                self._writer.write(self._ground_truth.topic, stamp_ns, message)
+
+    def _check_topic(self, raw_topic: str) -> None:
+        """Raise KfvoError for an image topic that is taken, or wrongly named rectified."""
+        others = {self._info_topic, STATIC_TOPIC}
+        if self._ground_truth is not None:
+            others.add(self._ground_truth.topic)
         if self._image_topic in others:
-            raise KfvoError(f'{base} is not for images in this recording; choose another --topic')
-        if self.camera is not None and self.camera.distortion and is_rectified(base):
-            raise KfvoError(f'{base} promises rectified images, but this camera distorts; choose '
-                            'a --topic without "rect"')
+            raise KfvoError(f'{raw_topic} is not for images in this recording; choose another '
+                            '--topic')
+        if self.camera is not None and self.camera.distortion and is_rectified(raw_topic):
+            raise KfvoError(f'{raw_topic} promises rectified images, but this camera distorts; '
+                            'choose a --topic without "rect"')
+
+
+class GroundTruthMessages:
+    """Ground truth as Odometry messages, or PointStamped where it has no rotations.
+
+    At the camera, the child frame is `camera_frame`, so that a reader needs no transform. A
+    measured frame that is identified by its topic keeps the topic, with an empty child frame.
+    Raises KfvoError for stamps that ROS cannot represent.
+    """
+
+    def __init__(self, ground_truth: GroundTruth, camera_frame: str) -> None:
+        order = np.argsort(ground_truth.trajectory.stamps_ns, kind='stable')
+        self._trajectory = ground_truth.trajectory.select(order)
+        self._next = 0
+        is_topic = ground_truth.frame.startswith('/')
+        default_topic = ODOMETRY_TOPIC if self._trajectory.has_rotation else POINT_TOPIC
+        self.topic = ground_truth.frame if is_topic else default_topic
+        frame = camera_frame if ground_truth.frame == 'camera' else ground_truth.frame
+        self._child_frame = '' if is_topic else frame
+        for extreme_ns in (*self._trajectory.stamps_ns[:1], *self._trajectory.stamps_ns[-1:]):
+            header_of(int(extreme_ns), WORLD_FRAME)
+
+    def earliest_ns(self, other_ns: int) -> int:
+        """Return the earlier of the first stamp and another."""
+        return min([other_ns, *self._trajectory.stamps_ns[:1].tolist()])
+
+    def until(self, end_ns: int | None) -> Iterator[tuple[int, Any]]:
+        """Yield the (stamp_ns, message) not yielded before, up to `end_ns`; all for None."""
+        stamps_ns = self._trajectory.stamps_ns
+        end = len(stamps_ns) if end_ns is None else np.searchsorted(stamps_ns, end_ns, 'right')
+        for index in range(self._next, int(end)):
+            self._next = index + 1
+            yield int(stamps_ns[index]), self._message(index)
+
+    def _message(self, index: int) -> Any:
+        stamp_ns, pose = int(self._trajectory.stamps_ns[index]), self._trajectory.poses[index]
+        if self._trajectory.has_rotation:
+            return odometry_message(stamp_ns, WORLD_FRAME, self._child_frame, pose)
+        return point_message(stamp_ns, WORLD_FRAME, pose)
 
 
 def _valid_topic(name: str) -> str:
-    """Return a topic's absolute name without /compressed; KfvoError where ROS 2 refuses it."""
+    """Return the absolute topic without /compressed; KfvoError for a name invalid in ROS 2."""
     topic = f'/{name.lstrip("/")}'.removesuffix('/compressed')
     if not _TOPIC.fullmatch(topic):
         raise KfvoError(f'expected a --topic like /camera/image_raw, came {name!r}')

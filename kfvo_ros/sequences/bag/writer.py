@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""One writer of rosbag2 recordings in MCAP, whose every failure is a KfvoError."""
+"""Writer of rosbag2 recordings in MCAP; every failure is a KfvoError."""
 
 from __future__ import annotations
 
@@ -32,27 +32,27 @@ from rosbags.typesys import Stores, get_typestore
 from kfvo_ros.errors import KfvoError, reason_of
 from kfvo_ros.sequences.bag.reader import BAG_SUFFIXES
 
-FOREVER = QosTime(9223372036, 854775807)
-"""What rmw calls an infinite duration."""
-STREAM = Qos(QosHistory.KEEP_LAST, 10, QosReliability.RELIABLE, QosDurability.VOLATILE, FOREVER,
-             FOREVER, QosLiveliness.AUTOMATIC, FOREVER, False)
-"""Quality of service of what comes again and again: subscribers of either reliability match."""
+INFINITE = QosTime(9223372036, 854775807)
+"""rmw's infinite duration."""
+STREAM = Qos(QosHistory.KEEP_LAST, 10, QosReliability.RELIABLE, QosDurability.VOLATILE, INFINITE,
+             INFINITE, QosLiveliness.AUTOMATIC, INFINITE, False)
+"""Quality of service of periodic topics; subscribers of either reliability match."""
 LATCHED = STREAM._replace(depth=1, durability=QosDurability.TRANSIENT_LOCAL)
-"""Quality of service of /tf_static: whoever subscribes late still gets it."""
+"""Quality of service of /tf_static: late subscribers receive the last message."""
 
 
-class Written(NamedTuple):
-    """What a topic of the bag holds."""
+class TopicInfo(NamedTuple):
+    """Type and number of the messages of one topic."""
 
     message_type: str
-    messages: int
+    message_count: int
 
 
 class BagWriter:
     """A new recording at ``path``, a folder that the first message creates.
 
-    Chunks are compressed if `zstd`; ROS 2 before Jazzy needs metadata of version 8. Raises
-    KfvoError for a path that is taken or cannot be written.
+    `zstd` compresses the chunks. ROS 2 before Jazzy needs metadata of version 8. Raises
+    KfvoError for a path that exists or cannot be written.
     """
 
     def __init__(self, path: Path, zstd: bool = False,
@@ -72,16 +72,17 @@ class BagWriter:
         self._failure: KfvoError | None = None
 
     @property
-    def topics(self) -> dict[str, Written]:
-        """What was written, by topic."""
-        return {connection.topic: Written(connection.msgtype, self._writer.counts[connection.id])
+    def topics(self) -> dict[str, TopicInfo]:
+        """Message type and count of the written topics."""
+        return {connection.topic: TopicInfo(connection.msgtype,
+                                            self._writer.counts[connection.id])
                 for connection in self._writer.connections}
 
     def write(self, topic: str, stamp_ns: int, message: Any, qos: Qos = STREAM) -> None:
-        """Append a message of rosbags; a topic has the type and the QoS of its first."""
+        """Append a rosbags message; the first one decides the type and QoS of its topic."""
         kind = message.__msgtype__
         data = self._store.serialize_cdr(message, kind)
-        with self._told():
+        with self._writing_errors():
             if not self._connections:
                 self._writer.open()
             if topic not in self._connections:
@@ -91,18 +92,18 @@ class BagWriter:
 
     def close(self) -> None:
         """Write the index and metadata.yaml."""
-        with self._told():
+        with self._writing_errors():
             self._writer.close()
 
     def discard(self) -> None:
-        """Delete what was written."""
+        """Delete the recording."""
         if self._connections:
             self._writer.abort()
             shutil.rmtree(self.path, ignore_errors=True)
 
     @contextmanager
-    def _told(self) -> Iterator[None]:
-        """Turn a failure to write into a KfvoError, then and ever after: the file is torn."""
+    def _writing_errors(self) -> Iterator[None]:
+        """Turn a failure to write into a KfvoError; later writes raise it again."""
         if self._failure is not None:
             raise self._failure
         try:
@@ -110,7 +111,7 @@ class BagWriter:
         except (OSError, WriterError) as error:
             with suppress(OSError):
                 self._writer.abort()
-            torn = '; what is there is incomplete: delete it, or rescue what "mcap recover" can'
+            advice = '; the bag is incomplete: delete it, or recover it with "mcap recover"'
             self._failure = KfvoError(f'cannot write {self.path}: {reason_of(error)}'
-                                      f'{torn if self._connections else ""}')
+                                      f'{advice if self._connections else ""}')
             raise self._failure from error

@@ -1,14 +1,14 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A ray caster for rooms full of textured boxes, whose bytes are the same on every machine.
+"""Ray caster for scenes of textured boxes, whose bytes are the same on every machine.
 
-In a pinhole image the inverse depth of a plane is a linear function of the pixel. A box is then
-six linear functions: a ray enters it at the smallest inverse depth over the planes that face
-the camera, and leaves it at the largest over the others.
+In a pinhole image the inverse depth of a plane is a linear function of the pixel. A box is six
+such functions: a ray enters it at the smallest inverse depth of the planes that face the camera,
+and leaves it at the largest of the others.
 
-Bytes repeat because nothing depends on a maths library or on the order of a sum: there are only
-float64 operations that IEEE 754 defines to the last bit and that Numba leaves in place without
-fastmath, then integers from the texels on.
+Bytes repeat because nothing depends on a maths library or on the order of a sum: all float64
+operations are defined to the last bit by IEEE 754 and kept in place by Numba without fastmath;
+from the texels on, arithmetic is in integers.
 """
 
 from __future__ import annotations
@@ -20,37 +20,23 @@ import numpy as np
 from numba import njit
 
 from kfvo_ros.camera import Camera
+from kfvo_ros.sequences.synthetic.scene import Scene
 from kfvo_ros.sequences.synthetic.shading import BoxFrameCamera, shade
 
 TILE = 16
-"""Boxes are sorted out for squares of so many pixels."""
-
-
-class Scene(NamedTuple):
-    """Upright boxes in a world with z up [m]; the first is the room, seen from inside.
-
-    ``turns`` (K, 2) cosine and sine of each box's heading, ``centres`` (K, 3), ``halves``
-    (K, 3) half sizes, ``faces`` (K, 6) shading.FACE in the order -x +x -y +y -z +z of the box's
-    axes, ``pyramids`` (N, -1) uint8 as shading.build_pyramid returns them, ``lamp`` (3,).
-    """
-
-    turns: np.ndarray
-    centres: np.ndarray
-    halves: np.ndarray
-    faces: np.ndarray
-    pyramids: np.ndarray
-    lamp: np.ndarray
+"""Boxes are culled per square tile of this side [px]."""
 
 
 class _Planes(NamedTuple):
-    """The planes of all boxes in an image.
+    """The planes of K boxes in an image.
 
-    inverse depth = ``slopes`` (K, 6, 3) @ (u, v, 1). The planes by which rays enter a box come
-    first, ``entries`` (K,) of them; ``sides`` (K, 6) says which face each plane is.
+    The inverse depth of a plane at pixel (u, v) is ``coefficients`` (K, 6, 3) @ (u, v, 1). The
+    planes by which rays enter a box come first; ``entry_counts`` (K,) is their number.
+    ``sides`` (K, 6) is the face of each plane.
     """
 
-    slopes: np.ndarray
-    entries: np.ndarray
+    coefficients: np.ndarray
+    entry_counts: np.ndarray
     sides: np.ndarray
 
 
@@ -62,23 +48,24 @@ def render(scene: Scene, camera: Camera, T_world_camera: np.ndarray
     """
     hits = np.empty((camera.height, camera.width), dtype=np.int32)
     radiance, depth = np.empty_like(hits), np.empty(hits.shape)
-    rays, origins = _in_box_frames(scene, T_world_camera, camera.fx, camera.cx, camera.cy)
-    _cast(_Planes(*_find_planes(scene.halves, rays, origins)), hits, depth)
+    rays, origins = _rays_in_box_frames(scene, T_world_camera, camera.fx, camera.cx, camera.cy)
+    _cast_rays(_Planes(*_project_planes(scene.half_sizes, rays, origins)), hits, depth)
     shade(scene, BoxFrameCamera(rays, origins, camera.fx), hits, depth, radiance)
     return radiance, depth
 
 
 @njit(cache=True)
-def _in_box_frames(scene, T_world_camera, focal, cx, cy):
-    """Return, per box, rays (K, 3, 3) with direction = rays @ (u, v, 1), and the camera (K, 3).
+def _rays_in_box_frames(scene: Scene, T_world_camera: np.ndarray, focal: float, cx: float,
+                        cy: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return rays (K, 3, 3) and origins (K, 3) of BoxFrameCamera.
 
-    Directions have length one along the optical axis: points are camera + depth * direction.
+    A point at a depth is origin + depth * rays @ (u, v, 1).
     """
     count = len(scene.centres)
     axes, origins = np.empty((count, 3, 4)), np.empty((count, 3))
     rays = np.empty((count, 3, 3))
     for box in range(count):
-        cosine, sine = scene.turns[box]
+        cosine, sine = scene.headings[box]
         for column in range(4):
             x, y, z = T_world_camera[:3, column]
             if column == 3:
@@ -97,106 +84,109 @@ def _in_box_frames(scene, T_world_camera, focal, cx, cy):
 
 
 @njit(cache=True)
-def _find_planes(halves, rays, origins):
-    """Return the members of _Planes."""
+def _project_planes(half_sizes: np.ndarray, rays: np.ndarray, origins: np.ndarray
+                    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the fields of _Planes."""
     count = len(origins)
-    slopes, sides = np.empty((count, 6, 3)), np.empty((count, 6), dtype=np.int32)
-    entries = np.zeros(count, dtype=np.int32)
+    coefficients, sides = np.empty((count, 6, 3)), np.empty((count, 6), dtype=np.int32)
+    entry_counts = np.zeros(count, dtype=np.int32)
     for box in range(count):
         last = 5
         for side in range(6):
             axis, sign = side // 2, 2.0 * (side % 2) - 1.0
-            distance = sign * halves[box, axis] - origins[box, axis]
+            distance = sign * half_sizes[box, axis] - origins[box, axis]
             if abs(distance) < 1e-9:
                 distance = 1e-9
             if sign * distance < 0.0:
-                place = entries[box]
-                entries[box] += 1
+                plane = entry_counts[box]
+                entry_counts[box] += 1
             else:
-                place = last
+                plane = last
                 last -= 1
-            sides[box, place] = side
+            sides[box, plane] = side
             for column in range(3):
-                slopes[box, place, column] = rays[box, axis, column] / distance
-    return slopes, entries, sides
+                coefficients[box, plane, column] = rays[box, axis, column] / distance
+    return coefficients, entry_counts, sides
 
 
 @njit(cache=True)
-def _cast(planes, hits, depth):
-    """Find what every pixel sees, hits (6 * box + side), and how far away, tile by tile."""
+def _cast_rays(planes: _Planes, hits: np.ndarray, depth: np.ndarray) -> None:
+    """Write the hit buffer, 6 * box + side per pixel, and its depth, tile by tile."""
     height, width = depth.shape
-    listed = np.empty(len(planes.entries), dtype=np.int32)
-    inverse, hit = np.empty(TILE), np.empty(TILE, dtype=np.int32)
+    visible = np.empty(len(planes.entry_counts), dtype=np.int32)
+    inverse_depth, hit = np.empty(TILE), np.empty(TILE, dtype=np.int32)
     scratch = np.empty(TILE), np.empty(TILE), np.empty(TILE, dtype=np.int32)
     for top in range(0, height, TILE):
         for left in range(0, width, TILE):
-            count = _list_boxes(planes, left, top, listed)
+            count = _cull_boxes(planes, left, top, visible)
             for v in range(top, min(top + TILE, height)):
-                _see_room(planes, left, v, inverse, hit)
-                for place in range(count):
-                    _see_box(planes, listed[place], left, v, inverse, hit, scratch)
+                _intersect_room(planes, left, v, inverse_depth, hit)
+                for index in range(count):
+                    _intersect_box(planes, visible[index], left, v, inverse_depth, hit, scratch)
                 for u in range(min(TILE, width - left)):
                     hits[v, left + u] = hit[u]
-                    depth[v, left + u] = 1.0 / inverse[u]
+                    depth[v, left + u] = 1.0 / inverse_depth[u]
 
 
 @njit(cache=True)
-def _list_boxes(planes, left, top, listed):
-    """Write the boxes that a tile may see, but for the room; return their number."""
+def _cull_boxes(planes: _Planes, left: int, top: int, visible: np.ndarray) -> int:
+    """Write the boxes that a tile may see, without the room; return their number."""
     reach = 0.5 * (TILE - 1)
     u, v = left + reach, top + reach
     count = 0
-    for box in range(1, len(planes.entries)):
-        enters, leaves = math.inf, 0.0
-        for place in range(6):
-            right, down = planes.slopes[box, place, 0], planes.slopes[box, place, 1]
-            middle = right * u + down * v + planes.slopes[box, place, 2]
+    for box in range(1, len(planes.entry_counts)):
+        near, far = math.inf, 0.0
+        for plane in range(6):
+            right, down = planes.coefficients[box, plane, 0], planes.coefficients[box, plane, 1]
+            middle = right * u + down * v + planes.coefficients[box, plane, 2]
             slack = (abs(right) + abs(down)) * reach
-            if place < planes.entries[box]:
-                enters = min(enters, middle + slack)
+            if plane < planes.entry_counts[box]:
+                near = min(near, middle + slack)
             else:
-                leaves = max(leaves, middle - slack)
-        if leaves < enters < math.inf:
-            listed[count] = box
+                far = max(far, middle - slack)
+        if far < near < math.inf:
+            visible[count] = box
             count += 1
     return count
 
 
 @njit(cache=True)
-def _see_room(planes, left, v, inverse, hit):
-    """Write the wall that a row of a tile sees and its inverse depth."""
-    inverse[:] = 0.0
-    for place in range(6):
-        slope, start = _along_row(planes, 0, place, left, v)
+def _intersect_room(planes: _Planes, left: int, v: int, inverse_depth: np.ndarray,
+                    hit: np.ndarray) -> None:
+    """Write the walls that a row of a tile hits, and their inverse depths."""
+    inverse_depth[:] = 0.0
+    for plane in range(6):
+        slope, start = _along_row(planes, 0, plane, left, v)
         for u in range(TILE):
             value = start + slope * u
-            hit[u] = planes.sides[0, place] if value > inverse[u] else hit[u]
-            inverse[u] = max(inverse[u], value)
+            hit[u] = planes.sides[0, plane] if value > inverse_depth[u] else hit[u]
+            inverse_depth[u] = max(inverse_depth[u], value)
 
 
 @njit(cache=True)
-def _see_box(planes, box, left, v, inverse, hit, scratch):
-    """Put a box where it is nearer than what a row of a tile has seen."""
-    enters, leaves, entry = scratch
-    enters[:], leaves[:] = math.inf, inverse
-    for place in range(6):
-        slope, start = _along_row(planes, box, place, left, v)
-        if place < planes.entries[box]:
-            face = 6 * box + planes.sides[box, place]
+def _intersect_box(planes: _Planes, box: int, left: int, v: int, inverse_depth: np.ndarray,
+                   hit: np.ndarray, scratch: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
+    """Overwrite the hits of a row of a tile where a box is nearer."""
+    near, far, near_face = scratch
+    near[:], far[:] = math.inf, inverse_depth
+    for plane in range(6):
+        slope, start = _along_row(planes, box, plane, left, v)
+        if plane < planes.entry_counts[box]:
+            face = 6 * box + planes.sides[box, plane]
             for u in range(TILE):
                 value = start + slope * u
-                entry[u] = face if value < enters[u] else entry[u]
-                enters[u] = min(enters[u], value)
+                near_face[u] = face if value < near[u] else near_face[u]
+                near[u] = min(near[u], value)
         else:
             for u in range(TILE):
-                leaves[u] = max(leaves[u], start + slope * u)
+                far[u] = max(far[u], start + slope * u)
     for u in range(TILE):
-        hit[u] = entry[u] if enters[u] > leaves[u] else hit[u]
-        inverse[u] = enters[u] if enters[u] > leaves[u] else inverse[u]
+        hit[u] = near_face[u] if near[u] > far[u] else hit[u]
+        inverse_depth[u] = near[u] if near[u] > far[u] else inverse_depth[u]
 
 
 @njit(cache=True)
-def _along_row(planes, box, place, left, v):
-    """Return how a plane's inverse depth changes along a row and what it is at `left`."""
-    right, down, start = planes.slopes[box, place]
+def _along_row(planes: _Planes, box: int, plane: int, left: int, v: int) -> tuple[float, float]:
+    """Return the slope of a plane's inverse depth along a row, and its value at `left`."""
+    right, down, start = planes.coefficients[box, plane]
     return right, right * left + down * v + start

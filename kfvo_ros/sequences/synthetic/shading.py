@@ -1,8 +1,9 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""How the faces of rendered boxes look: trilinear textures under one lamp.
+"""Shading of rendered images: trilinear textures, one point light, and a sensor model.
 
-Textures are square, repeat in both directions and are kept as pyramids of halved levels.
+Radiances and grey values are fixed-point integers, so that their bytes are the same on every
+machine.
 """
 
 from __future__ import annotations
@@ -13,39 +14,33 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-TEXTURE_BITS = 9
-TEXTURE_SIZE = 1 << TEXTURE_BITS
-"""Texels along a side of the finest level."""
-LEVEL_STARTS = np.array([(4 ** (TEXTURE_BITS + 1) - 4 ** (TEXTURE_BITS + 1 - level)) // 3
-                         for level in range(TEXTURE_BITS + 1)])
-"""Where each level starts in a pyramid, the finest first."""
-FACE = np.dtype([('texture', np.int32), ('scale_u', np.float64), ('scale_v', np.float64),
-                 ('offset_u', np.float64), ('offset_v', np.float64),
-                 ('bias', np.float64), ('contrast', np.float64)])
-"""How a face is painted: with bias + contrast * texel, the texel at scale [1/m] * place [m]
-from the middle of the face + offset."""
+from kfvo_ros.sequences.synthetic.scene import TEXTURE_BITS, Scene
+
+MIP_OFFSETS = np.array([(4 ** (TEXTURE_BITS + 1) - 4 ** (TEXTURE_BITS + 1 - level)) // 3
+                        for level in range(TEXTURE_BITS + 1)])
+"""Start of each mip level in what `scene.build_mipmap` returns."""
 RADIANCE_BITS = 6
-"""Radiances are grey values with this many binary digits after the point."""
+"""Fractional bits of radiances, which are grey values."""
 AMBIENT, DIFFUSE, LIGHT_RANGE = 0.65, 0.7, 3.0
-"""Light: a constant, and what the lamp adds, which is halved at this distance [m]."""
+"""Ambient light, and light of the lamp, which falls to half at LIGHT_RANGE [m]."""
 GAIN_BITS = 10
-"""The gain has this many binary digits after the point."""
+"""Fractional bits of the gain."""
 VALUE_BITS = RADIANCE_BITS + 4 + GAIN_BITS
-"""Digits after the point of a grey value that was blurred (sixteenfold) and amplified."""
+"""Fractional bits of a grey value after blur (a sum of weight 16) and gain."""
 NOISE_SCALE = round(2.0 * (1 << VALUE_BITS) / 209.02)
-"""Makes a sum of eight random bytes, of standard deviation 209.02, one of 2 grey values."""
+"""Scales a sum of eight random bytes, of standard deviation 209.02, to 2 grey values."""
 _FRAME_STRIDE = 0xD1342543DE82EF95
-"""Keeps the pixel counters of one frame far from those of the next."""
+"""Separates the pixel counters of successive frames."""
 _WEYL, _MIX = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xD6E8FEB86659FD93)
 _EVEN_BYTES, _SUM_OF_PAIRS = np.uint64(0x00FF00FF00FF00FF), np.uint64(0x0001000100010001)
 _32, _8, _48 = np.uint64(32), np.uint64(8), np.uint64(48)
 
 
 class BoxFrameCamera(NamedTuple):
-    """A camera in every box's frame.
+    """A camera in the frame of each box.
 
-    A pixel looks along ``rays`` (K, 3, 3) @ (u, v, 1), of length one along the optical axis,
-    from ``origins`` (K, 3) [m]; ``focal`` [px].
+    The ray of pixel (u, v) is ``rays`` (K, 3, 3) @ (u, v, 1), of length one along the optical
+    axis, from ``origins`` (K, 3) [m]; ``focal`` [px].
     """
 
     rays: np.ndarray
@@ -53,46 +48,43 @@ class BoxFrameCamera(NamedTuple):
     focal: float
 
 
-def build_pyramid(texture: np.ndarray) -> np.ndarray:
-    """Return all levels, flat and uint8, of grey values (TEXTURE_SIZE, TEXTURE_SIZE)."""
-    level: np.ndarray = np.clip(np.floor(texture + 0.5), 0.0, 255.0).astype(np.uint16)
-    levels = [level.ravel()]
-    for _ in range(TEXTURE_BITS):
-        level = (level[::2, ::2] + level[1::2, ::2] + level[::2, 1::2] + level[1::2, 1::2]
-                 + 2) >> 2
-        levels.append(level.ravel())
-    return np.concatenate(levels).astype(np.uint8)
-
-
 @njit(cache=True)
-def shade(scene, view, hits, depth, radiance):
-    """Write the radiance (H, W) int32 of `hits` (H, W), 6 * box + side, at `depth` (H, W)."""
+def shade(scene: Scene, camera: BoxFrameCamera, hits: np.ndarray, depth: np.ndarray,
+          radiance: np.ndarray) -> None:
+    """Write the radiance (H, W) int32 of a hit buffer (H, W) at `depth` (H, W) [m].
+
+    The hit buffer holds face numbers, 6 * box + side.
+    """
     height, width = hits.shape
-    lookups = np.empty((4, width))
+    samples = np.empty((4, width))
     for v in range(height):
         left = 0
         while left < width:
             hit, right = hits[v, left], left + 1
             while right < width and hits[v, right] == hit:
                 right += 1
-            _look_up(scene, view, hit // 6, hit % 6, v, left, right, depth, lookups)
+            _find_samples(scene, camera, hit // 6, hit % 6, v, left, right, depth, samples)
             face = scene.faces[hit // 6, hit % 6]
-            bias, contrast, pyramid = face.bias, face.contrast, scene.pyramids[face.texture]
+            bias, contrast, mipmap = face.bias, face.contrast, scene.mipmaps[face.texture]
             for u in range(left, right):
-                texel = _sample(pyramid, lookups[0, u], lookups[1, u], lookups[2, u])
-                radiance[v, u] = int((bias + contrast * texel) * lookups[3, u])
+                texel = _sample_trilinear(mipmap, samples[0, u], samples[1, u], samples[2, u])
+                radiance[v, u] = int((bias + contrast * texel) * samples[3, u])
             left = right
 
 
 @njit(cache=True)
-def _look_up(scene, view, box, side, v, left, right, depth, lookups):
-    """Write where a row of pixels meets a face's texture, u, v, how wide, and the light there."""
-    rays, face = view.rays, scene.faces[box, side]
-    origin_x, origin_y, origin_z = view.origins[box]
-    cosine, sine = scene.turns[box]
+def _find_samples(scene: Scene, camera: BoxFrameCamera, box: int, side: int, v: int, left: int,
+                  right: int, depth: np.ndarray, samples: np.ndarray) -> None:
+    """Write texture coordinates u and v, footprint [texel] and irradiance of a run of pixels.
+
+    The run, `left` to `right` in row `v`, sees one face; `samples` is (4, W).
+    """
+    rays, face = camera.rays, scene.faces[box, side]
+    origin_x, origin_y, origin_z = camera.origins[box]
+    cosine, sine = scene.headings[box]
     centre_x, centre_y, centre_z = scene.centres[box]
-    lamp_x, lamp_y, lamp_z = scene.lamp
-    scale = max(face.scale_u, face.scale_v) / view.focal
+    light_x, light_y, light_z = scene.light
+    scale = max(face.scale_u, face.scale_v) / camera.focal
     for u in range(left, right):
         ray_x = rays[box, 0, 0] * u + rays[box, 0, 1] * v + rays[box, 0, 2]
         ray_y = rays[box, 1, 0] * u + rays[box, 1, 1] * v + rays[box, 1, 2]
@@ -100,57 +92,57 @@ def _look_up(scene, view, box, side, v, left, right, depth, lookups):
         x = origin_x + depth[v, u] * ray_x
         y = origin_y + depth[v, u] * ray_y
         z = origin_z + depth[v, u] * ray_z
-        across, down = y if side < 2 else x, -z if side < 4 else y
-        lookups[0, u] = across * face.scale_u + face.offset_u
-        lookups[1, u] = down * face.scale_v + face.offset_v
-        # Seen squarely, a pixel covers depth / focal; on a slanted face it covers more, one way.
-        # The geometric mean of both ways lies between blur and aliasing.
-        facing = abs(ray_x if side < 2 else ray_y if side < 4 else ray_z)
+        face_u, face_v = y if side < 2 else x, -z if side < 4 else y
+        samples[0, u] = face_u * face.scale_u + face.offset_u
+        samples[1, u] = face_v * face.scale_v + face.offset_v
+        # At normal incidence a pixel covers depth / focal; at an angle it covers more in one
+        # direction. The geometric mean of both directions lies between blur and aliasing.
+        normal = abs(ray_x if side < 2 else ray_y if side < 4 else ray_z)
         length = math.sqrt(ray_x * ray_x + ray_y * ray_y + ray_z * ray_z)
-        lookups[2, u] = depth[v, u] * scale * math.sqrt(length / max(facing, 0.02))
-        to_x = cosine * x - sine * y + centre_x - lamp_x
-        to_y = sine * x + cosine * y + centre_y - lamp_y
-        to_z = z + centre_z - lamp_z
+        samples[2, u] = depth[v, u] * scale * math.sqrt(length / max(normal, 0.02))
+        to_x = cosine * x - sine * y + centre_x - light_x
+        to_y = sine * x + cosine * y + centre_y - light_y
+        to_z = z + centre_z - light_z
         squared = (to_x * to_x + to_y * to_y + to_z * to_z) / (LIGHT_RANGE * LIGHT_RANGE)
-        lookups[3, u] = (AMBIENT + DIFFUSE / (1.0 + squared)) * (1 << RADIANCE_BITS)
+        samples[3, u] = (AMBIENT + DIFFUSE / (1.0 + squared)) * (1 << RADIANCE_BITS)
 
 
 @njit(cache=True)
-def _sample(pyramid, u, v, footprint):
-    """Return the grey value at (u, v) where a pixel covers `footprint` texels, trilinear."""
+def _sample_trilinear(mipmap: np.ndarray, u: float, v: float, footprint: float) -> float:
+    """Return the grey value at (u, v) of a pixel that covers `footprint` texels."""
     level = 0
     while footprint >= 2.0 and level < TEXTURE_BITS - 2:
         footprint *= 0.5
         level += 1
-    value = _interpolate(pyramid, u, v, level)
+    value = _sample_bilinear(mipmap, u, v, level)
     blend = int(256.0 * (min(footprint, 2.0) - 1.0))
     if blend > 0:
-        value += ((_interpolate(pyramid, u, v, level + 1) - value) * blend) >> 8
+        value += ((_sample_bilinear(mipmap, u, v, level + 1) - value) * blend) >> 8
     return value / 65536.0
 
 
 @njit(cache=True)
-def _interpolate(pyramid, u, v, level):
-    """Return a level's grey value << 16 at (u, v), bilinear, in integers."""
+def _sample_bilinear(mipmap: np.ndarray, u: float, v: float, level: int) -> int:
+    """Return the grey value << 16 of a mip level at (u, v), in integer arithmetic."""
     bits = TEXTURE_BITS - level
     wrap = (1 << bits) - 1
     fixed_u = int(math.floor(u * 256.0 / (1 << level))) - 128
     fixed_v = int(math.floor(v * 256.0 / (1 << level))) - 128
     left, top = (fixed_u >> 8) & wrap, (fixed_v >> 8) & wrap
     right, bottom = (left + 1) & wrap, (top + 1) & wrap
-    upper = LEVEL_STARTS[level] + (top << bits)
-    lower = LEVEL_STARTS[level] + (bottom << bits)
+    upper = MIP_OFFSETS[level] + (top << bits)
+    lower = MIP_OFFSETS[level] + (bottom << bits)
     weight_u, weight_v = fixed_u & 255, fixed_v & 255
-    above = pyramid[upper + left] * (256 - weight_u) + pyramid[upper + right] * weight_u
-    below = pyramid[lower + left] * (256 - weight_u) + pyramid[lower + right] * weight_u
+    above = mipmap[upper + left] * (256 - weight_u) + mipmap[upper + right] * weight_u
+    below = mipmap[lower + left] * (256 - weight_u) + mipmap[lower + right] * weight_u
     return above * (256 - weight_v) + below * weight_v
 
 
-def expose(radiance: np.ndarray, gain: float, noise_key: int) -> np.ndarray:
-    """Return the image (H, W) uint8 of a radiance (H, W) as `rendering.render` returns it.
+def simulate_sensor(radiance: np.ndarray, gain: float, noise_key: int) -> np.ndarray:
+    """Return the image (H, W) uint8 of a radiance (H, W) as `renderer.render` returns it.
 
-    The lens blurs by a 3x3 binomial; the noise has sigma 2 grey values and is selected by
-    `noise_key`, 64 bits.
+    The lens blurs by a 3x3 binomial kernel. Noise has a sigma of 2 grey values; `noise_key`,
+    64 bits, seeds it.
     """
     image = np.empty(radiance.shape, dtype=np.uint8)
     key = np.uint64(noise_key * _FRAME_STRIDE % (1 << 64))
@@ -159,7 +151,7 @@ def expose(radiance: np.ndarray, gain: float, noise_key: int) -> np.ndarray:
 
 
 @njit(cache=True)
-def _expose(radiance, gain, noise_key, image):
+def _expose(radiance: np.ndarray, gain: int, noise_key: np.uint64, image: np.ndarray) -> None:
     """Blur, amplify, add noise, round and clip."""
     height, width = radiance.shape
     column_sums = np.empty(width + 2, dtype=np.int64)
@@ -171,12 +163,12 @@ def _expose(radiance, gain, noise_key, image):
         column_sums[0], column_sums[width + 1] = column_sums[1], column_sums[width]
         for u in range(width):
             blurred = column_sums[u] + 2 * column_sums[u + 1] + column_sums[u + 2]
-            noise = NOISE_SCALE * _noise(noise_key, v * width + u)
+            noise = NOISE_SCALE * _pixel_noise(noise_key, v * width + u)
             image[v, u] = min(max((blurred * gain + noise + half) >> VALUE_BITS, 0), 255)
 
 
 @njit(cache=True)
-def _noise(key, pixel):
+def _pixel_noise(key: np.uint64, pixel: int) -> np.int64:
     """Return the sum of the eight bytes of a pixel's hash, centred: nearly normal."""
     bits = (key + np.uint64(pixel)) * _WEYL
     bits = (bits ^ (bits >> _32)) * _MIX

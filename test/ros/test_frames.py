@@ -1,0 +1,137 @@
+# Copyright 2026 The kfvo_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""TF: the camera's place on the base is looked up in a tree, and the base's pose is sent."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from math import cos, pi, sin
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from node_rig import DIAGNOSTICS, Rig, make_frames, stamp_ns, to_pose
+from ros_processes import Listener, environment, wait_until
+
+from kfvo_ros import geometry
+from kfvo_ros.odometry.base_motion import base_motion
+from kfvo_ros.odometry.factory import make_odometry
+from kfvo_ros.odometry.online import OnlineOdometry, TrajectoryLog
+from kfvo_ros.odometry.options import OdometryOptions
+from kfvo_ros.ros import frames as module
+from kfvo_ros.ros.messages import make_transform, to_transform
+from kfvo_ros.ros.options import NodeOptions
+from kfvo_ros.trajectory import NANOSECONDS
+
+geometry_msgs = pytest.importorskip('geometry_msgs.msg')
+
+FAKE_TF2 = Path(__file__).parents[1] / 'fake_tf2'
+FRAMES = make_frames()[:16]
+COSINE, SINE = cos(pi / 6), sin(pi / 6)
+T_BASE_LENS = np.array([
+    [1.0, 0.0, 0.0, 0.18], [0.0, -SINE, COSINE, 0.03 * COSINE + 0.01 * SINE],
+    [0.0, -COSINE, -SINE, 1.05 - 0.03 * SINE + 0.01 * COSINE], [0.0, 0.0, 0.0, 1.0]])
+"""Of a mast that turned left by 90 degrees, whose camera looks down by 30."""
+
+
+@pytest.fixture
+def tf2_ros(monkeypatch) -> ModuleType:
+    """Return the fake tf2_ros, as which `kfvo_ros.ros.frames` has imported it."""
+    spec = importlib.util.spec_from_file_location('tf2_ros', FAKE_TF2 / 'tf2_ros.py')
+    fake = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, 'tf2_ros', fake)
+    spec.loader.exec_module(fake)
+    monkeypatch.setattr(module, 'tf2_ros', fake)
+    return fake
+
+
+def make_edge(parent: str, child: str, translation: tuple[float, float, float],
+              rotation: np.ndarray, seconds: int):
+    """Return T_parent_child of a rotation vector as TF has it."""
+    return make_transform(seconds * NANOSECONDS, parent, child, geometry.make_transform(
+        geometry.exp_so3(rotation), np.array(translation)))
+
+
+def make_tree() -> list:
+    """Return a recorded tree: base_link, a mast that turns, camera_link, lens."""
+    optical = make_edge('camera_link', 'lens', (0.03, 0.02, 0.01), np.zeros(3), 10)
+    rotation = optical.transform.rotation
+    rotation.x, rotation.y, rotation.z, rotation.w = -0.5, 0.5, -0.5, 0.5
+    return [make_edge('base_link', 'mast', (0.2, -0.1, 1.0), np.zeros(3), 10),
+            make_edge('base_link', 'mast', (0.2, -0.1, 1.0), np.array([0.0, 0.0, pi / 2]), 20),
+            make_edge('mast', 'camera_link', (0.1, 0.0, 0.05), np.array([0.0, pi / 6, 0.0]), 10),
+            optical, make_edge('map', 'odom', (5.0, 0.0, 0.0), np.array([0.0, 0.0, 1.0]), 10)]
+
+
+def test_camera_pose_in_the_base_is_the_latest_of_the_tree(tf2_ros):
+    with Listener({}) as robot, Listener({}) as listener:
+        base = module.BaseFrame(listener.node, NodeOptions(base_frame='base_link'))
+        assert base.name('lens') == 'base_link'
+        assert base.transform('lens') is None
+        problem = base.problem('lens')
+        assert 'from base_link to lens' in problem and 'set base_to_camera' in problem
+        broadcaster = tf2_ros.TransformBroadcaster(robot.node)
+        for edge in make_tree():
+            broadcaster.sendTransform(edge)
+        wait_until(lambda: base.transform('lens') is not None)
+        np.testing.assert_allclose(base.transform('lens'), T_BASE_LENS, atol=1e-12)
+        other = module.BaseFrame(listener.node, NodeOptions(base_frame='map'))
+        assert other.transform('lens') is None  # the trees are not connected
+
+
+@pytest.mark.parametrize('enabled', [True, False])
+def test_sender_sends_transforms_unchanged_if_enabled(tf2_ros, enabled):
+    sent = make_edge('odom', 'base_link', (1.0, -2.0, 0.5), np.array([0.3, -1.2, 0.5]), 7)
+    with Listener({tf2_ros.TOPIC: geometry_msgs.TransformStamped}, tf2_ros.QOS) as listener:
+        sender = module.TransformSender(listener.node, enabled)
+        sender.send(sent)
+        if enabled:
+            wait_until(lambda: listener.messages(tf2_ros.TOPIC))
+            assert listener.messages(tf2_ros.TOPIC) == [sent]
+        else:
+            assert listener.node.count_publishers(tf2_ros.TOPIC) == 0
+
+
+def test_node_publishes_nothing_until_tf_is_known_and_then_the_base(tf2_ros):
+    """Poses, twists and covariances of the base; TF from odom to base_link with the same pose."""
+    online = OnlineOdometry(make_odometry(OdometryOptions()), TrajectoryLog())
+    expected = [base_motion(online.process(frame), T_BASE_LENS) for frame in FRAMES]
+    tf = Listener({tf2_ros.TOPIC: geometry_msgs.TransformStamped}, tf2_ros.QOS)
+    with tf, Rig(env=environment(FAKE_TF2), base_frame='base_link') as rig:
+        rig.send(FRAMES[:4])
+        rig.wait_for_line('no transform from base_link to lens')
+        rig.wait_for_value('images processed', 4)
+        assert not rig.odometry() and not tf.messages(tf2_ros.TOPIC)
+        broadcaster = tf2_ros.TransformBroadcaster(tf.node)
+        for edge in make_tree():
+            broadcaster.sendTransform(edge)
+        count = len(rig.listener.messages(DIAGNOSTICS))  # sent each second, after the tree came
+        wait_until(lambda: len(rig.listener.messages(DIAGNOSTICS)) >= count + 2)
+        messages = rig.run(FRAMES[4:])
+        rig.wait_for_line('frames: odom -> base_link, images in lens')
+
+        def from_odom() -> list:
+            return [message for message in tf.messages(tf2_ros.TOPIC)
+                    if message.header.frame_id == 'odom']
+
+        wait_until(lambda: len(from_odom()) == len(messages))
+        sent = from_odom()
+    assert [stamp_ns(message) for message in messages] == [
+        frame.stamp_ns for frame in FRAMES[4:]]
+    for message, transform, motion in zip(messages, sent, expected[4:], strict=True):
+        assert (message.header.frame_id, message.child_frame_id) == ('odom', 'base_link')
+        pose = to_pose(message.pose.pose)
+        np.testing.assert_allclose(pose, motion.T_odom_base, atol=1e-9)
+        np.testing.assert_allclose(np.reshape(message.pose.covariance, (6, 6)),
+                                   motion.covariance, rtol=1e-6, atol=1e-12)
+        twist = message.twist.twist
+        np.testing.assert_allclose(
+            [getattr(part, axis) for part in (twist.linear, twist.angular) for axis in 'xyz'],
+            motion.twist, atol=1e-7)
+        np.testing.assert_allclose(np.reshape(message.twist.covariance, (6, 6)),
+                                   motion.twist_covariance, rtol=1e-6, atol=1e-9)
+        assert (transform.header, transform.child_frame_id) == (message.header, 'base_link')
+        np.testing.assert_allclose(to_transform(transform), pose, atol=1e-12)
+    assert np.abs(expected[-1].T_odom_base - np.eye(4)).max() > 0.01
