@@ -47,13 +47,14 @@ SEQUENCES ?= $(patsubst $(KFVO_DATA)/%/,%,$(sort $(dir $(FOUND)))) \
 POLICY ?=
 OPTIONS ?= --seeds 0,1,2
 
-.PHONY: help demo bench-node bench-train results test lint clean
+.PHONY: help demo bench-node bench-train bench-vggt results test lint clean
 
 help:
 	@echo 'make demo    a rendered sequence through kfvo_node, over DDS, into demo/'
-	@echo 'make test    install into $(VENV) and run ruff and the tests'
+	@echo 'make test    install into $(VENV) and run ruff, mypy and the tests'
 	@echo 'make bench-node   a minute of 752x480 at 20 Hz, then at twice what the node can take'
 	@echo 'make bench-train  decisions per second of the environment, and of PPO'
+	@echo 'make bench-vggt   a step of the VGGT backbone, in full and with reuse'
 	@echo 'make results  docs/results.md: all methods on KFVO_DATA, rooms and streets; POLICY=FILE: a'
 	@echo '              learned one too. It goes on where it was interrupted'
 	@echo 'make lint    ruff and mypy'
@@ -72,14 +73,16 @@ bench-node: $(INSTALLED)
 bench-train: $(TOOLS)
 	$(VENV)/bin/python benchmarks/training.py
 
+bench-vggt: $(TOOLS)
+	$(VENV)/bin/python benchmarks/vggt.py --size 168x224
+
 results: $(TOOLS)
 	cd '$(or $(wildcard $(KFVO_DATA)),.)' && '$(CURDIR)/$(VENV)/bin/python' -m \
 		kfvo_ros.benchmark $(SEQUENCES) $(OPTIONS) --resume --output '$(CURDIR)/results' \
 		$(if $(POLICY),--policy '$(abspath $(POLICY))')
 	cp results/results.md results/trajectories.png results/errors.png docs/
 
-test: $(TOOLS)
-	$(VENV)/bin/ruff check .
+test: lint
 	[ ! -d '$(KFVO_DATA)' ] || export KFVO_DATA="$$(cd '$(KFVO_DATA)' && pwd)"; \
 	PYTEST_DISABLE_PLUGIN_AUTOLOAD=1 $(VENV)/bin/python -m pytest -rs \
 		-p xdist -n 2 --dist loadgroup

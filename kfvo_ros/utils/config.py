@@ -117,7 +117,6 @@ class Option:
                 and (self.most is None or value <= self.most))
 
 
-@functools.cache
 def options_of(kind: type[Any]) -> tuple[Option, ...]:
     """Return the options that an options dataclass declares, in order."""
     hints = typing.get_type_hints(kind)

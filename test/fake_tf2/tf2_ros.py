@@ -71,6 +71,14 @@ class Buffer:
             setattr(message.transform.translation, name, value)
         return message
 
+    def can_transform(self, target_frame: str, source_frame: str, time: Time) -> bool:
+        """Return whether `lookup_transform` returns a transform."""
+        try:
+            self.lookup_transform(target_frame, source_frame, time)
+            return True
+        except TransformException:
+            return False
+
 
 class TransformListener:
     """Records transforms of the topic in a buffer."""

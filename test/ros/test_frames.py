@@ -26,6 +26,7 @@ from kfvo_ros.ros.options import NodeOptions
 from kfvo_ros.trajectory import NANOSECONDS
 
 geometry_msgs = pytest.importorskip('geometry_msgs.msg')
+Time = pytest.importorskip('rclpy.time').Time
 
 FAKE_TF2 = Path(__file__).parents[1] / 'fake_tf2'
 FRAMES = make_frames()[:16]
@@ -68,6 +69,7 @@ def make_tree() -> list:
 def test_camera_pose_in_the_base_is_the_latest_of_the_tree(tf2_ros):
     with Listener({}) as robot, Listener({}) as listener:
         base = module.BaseFrame(listener.node, NodeOptions(base_frame='base_link'))
+        unconnected = module.BaseFrame(listener.node, NodeOptions(base_frame='map'))
         assert base.name('lens') == 'base_link'
         assert base.transform('lens') is None
         problem = base.problem('lens')
@@ -77,8 +79,8 @@ def test_camera_pose_in_the_base_is_the_latest_of_the_tree(tf2_ros):
             broadcaster.sendTransform(edge)
         wait_until(lambda: base.transform('lens') is not None)
         np.testing.assert_allclose(base.transform('lens'), T_BASE_LENS, atol=1e-12)
-        other = module.BaseFrame(listener.node, NodeOptions(base_frame='map'))
-        assert other.transform('lens') is None  # the trees are not connected
+        wait_until(lambda: unconnected._buffer.can_transform('map', 'odom', Time()))
+        assert unconnected.transform('lens') is None
 
 
 @pytest.mark.parametrize('enabled', [True, False])
