@@ -1,15 +1,15 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
 #
-# A virtual environment, the tests, and nothing that touches the system's Python.
+# Virtual environment, tests, benchmarks and demo; the system's Python is never changed.
 
 SHELL := /bin/sh
 KFVO_DATA ?= ../shared/data
 unexport KFVO_DATA
 comma := ,
 
-# A sourced ROS brings its own rclpy, Python and numpy; elsewhere the wheels of the `ros` extra
-# do, which exist for Linux on x86-64.
+# A sourced ROS has its own rclpy, Python and numpy; elsewhere the `ros` extra installs wheels,
+# which exist for Linux on x86-64 only.
 ifneq ($(ROS_DISTRO),)
 CONSTRAINTS ?= constraints-jazzy.txt
 CANDIDATES := python3
@@ -21,7 +21,7 @@ CANDIDATES := python3.13 python3.12 python3.11 python3.10 python3
 ROS := $(if $(findstring Linux x86_64,$(shell uname -sm)),ros$(comma))
 endif
 
-# One environment per constraints file, .venv and .venv-jazzy, and others under a sourced ROS.
+# One environment per constraints file: .venv, .venv-jazzy, and -ros of each with a sourced ROS.
 PINS := $(basename $(notdir $(CONSTRAINTS)))
 VENV := .venv$(PINS:constraints%=%)$(if $(ROS_DISTRO),-ros)
 INSTALLED := $(VENV)/.installed
@@ -30,15 +30,15 @@ PIP_INSTALL = $(VENV)/bin/python -m pip install --quiet --disable-pip-version-ch
 	--constraint $(CONSTRAINTS) --editable
 NEWEST := $(if $(findstring jazzy,$(CONSTRAINTS)),12,13)
 
-# The first candidate that runs and has a wheel of every pinned package.
+# The first candidate that runs and is new enough, but not newer than the pinned wheels.
 SUPPORTED := import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, $(NEWEST)))
 ifndef PYTHON
 PYTHON := $(shell for python in $(CANDIDATES); do \
 	$$python -c '$(SUPPORTED)' 2>/dev/null && echo $$python && break; done)
 endif
 
-# docs/results.md: what of KFVO_DATA looks like a dataset, called as from there, and what is
-# rendered.
+# Sequences of docs/results.md: the datasets found in KFVO_DATA, by paths relative to it, and
+# rendered ones.
 MARKS := mav0 rgb.txt times.txt pose_left.txt
 FOUND = $(foreach mark,$(MARKS),$(foreach depth,* */* */*/* */*/*/*,\
 	$(wildcard $(KFVO_DATA)/$(depth)/$(mark))))

@@ -17,7 +17,7 @@ setup(
     maintainer='The kfvo_ros authors',
     maintainer_email='maintainers@kfvo-ros.example',
     packages=find_packages(include=[NAME, f'{NAME}.*']),
-    package_data={f'{NAME}.evaluation': ['published.yaml'],
+    package_data={NAME: ['py.typed'], f'{NAME}.evaluation': ['published.yaml'],
                   f'{NAME}.keyframes': ['*.safetensors']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
@@ -39,7 +39,7 @@ setup(
     ],
     extras_require={
         # ROS 2 Jazzy as wheels (Linux x86-64 only), for machines without /opt/ros. The
-        # ros-jazzy-* names choose the distribution, the exact versions keep pip from the next.
+        # ros-jazzy-* packages select the distribution; the exact versions prevent a newer one.
         'ros': [
             'ros-jazzy-rclpy',
             'ros-jazzy-common-interfaces',

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Keyframe-based feed-forward visual odometry for ROS 2.
 
-The public names are imported when they are first used::
+The public names are imported on first use::
 
     from kfvo_ros import make_odometry, open_sequence
 
@@ -37,7 +37,7 @@ _MODULES = {
     'OdometryOptions': 'odometry.options', 'Sequence': 'sequences.base',
     'Trajectory': 'trajectory', 'Update': 'odometry.updates', 'VggtOptions': 'odometry.options',
     'make_odometry': 'odometry.factory', 'open_sequence': 'sequences'}
-"""Where the public names are defined: commands answer --help without importing numpy."""
+"""Modules of the public names; they are imported lazily, since commands answer --help at once."""
 
 
 def __getattr__(name: str) -> Any:

@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""``python -m kfvo_ros.run SEQUENCE --output DIR``: odometry over every frame of a sequence."""
+"""``python -m kfvo_ros.run SEQUENCE --output FOLDER``: odometry over a sequence."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _run(argv: list[str]) -> None:
-    # The heavy imports come after the arguments were checked: --help answers at once.
+    # Slow imports follow the check of the arguments, so that --help is fast.
     from kfvo_ros.odometry.options import OdometryOptions, SequenceOptions, VggtOptions
     from kfvo_ros.utils.config import from_arguments
     arguments = _parse(argv)
@@ -48,12 +48,12 @@ def _run(argv: list[str]) -> None:
                  'keyframe_policy': odometry.policy.name, 'scale_rule': odometry.scale.rule,
                  'seed': odometry_options.seed, 'version': __version__,
                  **odometry.backbone.device_info()}
-        with signals_collected():  # an impatient second Ctrl-C would cost the summary
+        with signals_collected():  # a second Ctrl-C must not lose the summary
             writer.append(odometry.finish())
             summary = writer.finish(about | ({'ended_early': problem} if problem else {}), truth)
     print(_describe(summary, writer.folder))
     if problem:
-        raise KfvoError(f'{problem}; what was computed is in {writer.folder}')
+        raise KfvoError(f'{problem}; the results so far are in {writer.folder}')
 
 
 def _parse(argv: list[str]) -> argparse.Namespace:
@@ -72,7 +72,7 @@ def _parse(argv: list[str]) -> argparse.Namespace:
 
 
 def _process(sequence: Any, odometry: Any, writer: Any, stop: int | None) -> str | None:
-    """Feed the frames; return why it ended before the end, if it did."""
+    """Process the frames; return why it ended early, None if it did not."""
     from tqdm import tqdm
     total = sequence.length if stop is None else min(stop, sequence.length or stop)
     try:
@@ -86,7 +86,7 @@ def _process(sequence: Any, odometry: Any, writer: Any, stop: int | None) -> str
 
 
 def _describe(summary: dict[str, Any], folder: Path) -> str:
-    """Return the few lines a person wants to see at the end."""
+    """Return the lines that are printed at the end."""
     total = summary['ms_per_frame'].get('total', {'median': 0.0, 'p95': 0.0})
     lines = [f'{summary["frames"]} frames, {summary["keyframes"]} keyframes, '
              f'{summary["lost_frames"]} lost; {total["median"]:.1f} ms per frame '

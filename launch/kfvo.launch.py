@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Start kfvo_node, and on request a bag and RViz: ros2 launch kfvo_ros kfvo.launch.py -s."""
+"""Start kfvo_node, optionally a bag and RViz; ``-s`` lists the launch arguments."""
 
 from pathlib import Path
 
@@ -15,9 +15,9 @@ from kfvo_ros.utils.config import Option
 from launch import LaunchContext, LaunchDescription
 
 SHARE = Path(__file__).resolve().parent.parent
-USE_SIM_TIME = Option('use_sim_time', bool, False, False, False, 'take the time of /clock')
+USE_SIM_TIME = Option('use_sim_time', bool, False, False, False, 'use the time of /clock')
 PARAMETERS = {each.name: each for each in (*node_parameters(), USE_SIM_TIME)}
-"""Parameters of the node; an argument that is left empty is not passed on."""
+"""Parameters of the node; an empty argument is not passed on."""
 OTHERS = {
     'preset': ('', 'parameters of a dataset (euroc, tum, kitti), or a parameter file'),
     'namespace': ('', 'namespace of the node'),
@@ -38,14 +38,14 @@ def generate_launch_description() -> LaunchDescription:
 
 
 def _describe(parameter: Option) -> str:
-    """Return description and default; empty leaves the preset's value, or the node's."""
+    """Return description and default; an empty argument keeps the value of preset or node."""
     default = '' if parameter.default in (None, '') else f' (default of the node: ' \
                                                          f'{parameter.default})'
     return f'{parameter.description}{default}'
 
 
 def _start(context: LaunchContext) -> list[Action]:
-    """Start the node with the arguments that were given, and the bag."""
+    """Return the actions that start the node, with the given arguments, and the bag."""
     given = {name: LaunchConfiguration(name).perform(context)
              for name in (*PARAMETERS, 'preset', 'namespace', 'bag')}
     parameters: list[str | dict] = []

@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Commands as users start them: processes of their own, their signals and their last line."""
+"""Run commands as processes, send them signals, and check their error messages."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import Any
 
 import kfvo_ros
 
-# A sourced ROS is on the path already.
+# A sourced ROS is already on the path.
 ENVIRONMENT = os.environ | {'PYTHONPATH': os.pathsep.join(
     filter(None, [str(Path(kfvo_ros.__file__).parents[1]), os.environ.get('PYTHONPATH')]))}
 
@@ -33,19 +33,19 @@ def run_interrupted(sent: signal.Signals, ready: Callable[[], bool], *arguments:
     process = subprocess.Popen([sys.executable, *map(str, arguments)], stdout=subprocess.PIPE,
                                stderr=subprocess.PIPE, text=True, env=ENVIRONMENT)
     try:
-        patience = time.monotonic() + 60.0
+        deadline = time.monotonic() + 60.0
         while not ready():
-            assert time.monotonic() < patience
+            assert time.monotonic() < deadline
             time.sleep(0.02)
         process.send_signal(sent)
-        output, problems = process.communicate(timeout=30.0)
+        output, errors = process.communicate(timeout=30.0)
     finally:
         process.kill()
-    return process.returncode, output, problems
+    return process.returncode, output, errors
 
 
 def one_readable_line(done: subprocess.CompletedProcess[str]) -> str:
-    """Assert that it failed with one readable line and return that."""
+    """Assert that the process failed with one line and no traceback; return the line."""
     assert done.returncode != 0
     assert 'Traceback' not in done.stderr + (done.stdout or '')
     lines = [line for line in done.stderr.splitlines() if 'error:' in line]
@@ -54,6 +54,6 @@ def one_readable_line(done: subprocess.CompletedProcess[str]) -> str:
 
 
 def assert_one_readable_line(done: subprocess.CompletedProcess[str], *parts: str) -> None:
-    """Assert that it failed with one readable line that has these parts."""
+    """Assert that the process failed with one line that contains `parts`."""
     line = one_readable_line(done)
     assert all(part in line for part in parts), line

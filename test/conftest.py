@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What several tests share."""
+"""Fixtures of several tests, and the distribution of tests over processes."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from kfvo_ros.utils.process import single_threaded
 from kfvo_ros.utils.signals import SIGNALS
 
 OVER_DDS = ('test_demo', 'test_vggt_node')
-"""Test files, besides those of test/ros, that communicate over DDS and are timed: run in turn."""
+"""Test files outside test/ros that communicate over DDS and are timed: they run in sequence."""
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Tell pytest-xdist what stays together: the tests of a file, and all that talk over DDS."""
+    """Group the tests of a file, and all tests over DDS, for pytest-xdist."""
     for item in items:
         name, folder = item.path.stem, item.path.parent.name
         item.add_marker(pytest.mark.xdist_group(
@@ -29,21 +29,21 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope='session', autouse=True)
 def one_thread() -> Iterator[None]:
-    """Solve windows as the commands do: threads of BLAS that wait for each other cost minutes."""
+    """Run BLAS and OpenCV in one thread, as the commands do; more take minutes longer."""
     with single_threaded():
         yield
 
 
 @pytest.fixture(scope='session', autouse=True)
 def interruptible() -> None:
-    """Let the processes that tests interrupt be so: a shell's background jobs ignore SIGINT."""
+    """Handle SIGINT here and in child processes: background jobs of a shell ignore it."""
     if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope='module')
 def own_signals() -> Iterator[None]:
-    """Give back the signals that commands called in this process take for themselves."""
+    """Restore the signal handlers that commands set when they run in this process."""
     handlers = {number: signal.getsignal(number) for number in SIGNALS}
     yield
     for number, handler in handlers.items():

@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Test scenes for odometry: projected point clouds and small rendered sequences."""
+"""Scenes for tests of odometry: projected point clouds and small rendered sequences."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from kfvo_ros.trajectory import Trajectory
 CAMERA = Camera(640, 480, 400.0, 400.0, 319.5, 239.5)
 RATE_NS = 50_000_000
 PATTERN = [True, False, False, True, False]
-"""Decisions of a Scripted policy, to be repeated."""
+"""Decisions of a ScriptedPolicy, to be repeated."""
 
 
 def certain_tracks(ids: np.ndarray, pixels: np.ndarray) -> Tracks:
@@ -103,8 +103,8 @@ def restamped(images: Iterable[np.ndarray], camera: Camera) -> list[Frame]:
 
 
 @dataclass
-class Run:
-    """Output of an odometry: updates, final poses, and their copies at the time of emission."""
+class OdometryRun:
+    """Output of an odometry: updates, final poses, and copies of these when they became final."""
 
     updates: list[Update]
     final: list[FramePose]
@@ -127,10 +127,10 @@ class Run:
 
 
 def run(frames: Iterable[Frame], policy: KeyframePolicy | None = None,
-        backbone: Backbone | None = None, **options) -> Run:
+        backbone: Backbone | None = None, **options) -> OdometryRun:
     """Process frames with a new odometry."""
     odometry = KeyframeOdometry(backbone or GeometricBackbone(), policy or Survival(), **options)
-    result = Run([], [], [])
+    result = OdometryRun([], [], [])
     for frame in frames:
         update = odometry.process(frame)
         result.updates.append(update)
@@ -142,18 +142,18 @@ def run(frames: Iterable[Frame], policy: KeyframePolicy | None = None,
     return result
 
 
-class Scripted(KeyframePolicy):
-    """Returns the decisions of a list; the last one repeats."""
+class ScriptedPolicy(KeyframePolicy):
+    """Returns given decisions in order; repeats the last one."""
 
     name = 'scripted'
 
     def __init__(self, *keeps: bool) -> None:
         self._keeps = list(keeps)
-        self.seen: list[DecisionInput] = []
+        self.inputs: list[DecisionInput] = []
 
     def decide(self, decision: DecisionInput) -> bool:
         """Return the next decision."""
-        self.seen.append(decision)
+        self.inputs.append(decision)
         return self._keeps.pop(0) if len(self._keeps) > 1 else self._keeps[0]
 
 

@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""``python -m kfvo_ros.ablation``: rows that are short trainings, tested, and gone on with."""
+"""``python -m kfvo_ros.ablation``: rows of short trainings, their table, and resumption."""
 
 from __future__ import annotations
 
@@ -20,11 +20,12 @@ pytest.importorskip('tensorboard', reason="tensorboard is not installed: pip ins
 pytest.importorskip('matplotlib', reason="matplotlib is not installed: pip install '.[demo]'")
 
 from kfvo_ros import ablation
+from kfvo_ros.errors import KfvoError
 from kfvo_ros.keyframes.learned import read_policy
 from kfvo_ros.odometry import factory
-from kfvo_ros.training.ablation import ROWS, row_config
+from kfvo_ros.training.ablation import read_ablation_rows
+from kfvo_ros.training.ablation_report import read_curve
 from kfvo_ros.training.config import read_training_config
-from kfvo_ros.training.curves import read_curve
 from kfvo_ros.training.rewards import ALPHA
 from kfvo_ros.utils.files import find_config
 
@@ -32,7 +33,7 @@ pytestmark = pytest.mark.usefixtures('own_signals')
 
 TRAINED = ('full', 'local_signals_only')
 TESTED = ('synthetic:5:smooth', 'synthetic:6:smooth')
-UNLEARNED = ('every', 'optical_flow', 'survival', 'random', 'rail', 'constant_position',
+REFERENCES = ('every', 'optical_flow', 'survival', 'random', 'rail', 'constant_position',
              'straight_line')
 
 
@@ -74,16 +75,16 @@ def refused(capsys, *arguments: object) -> str:
 
 
 def files(output: Path) -> dict[str, int]:
-    """Return when each policy was written."""
+    """Return the modification time of each policy."""
     return {path.name: path.stat().st_mtime_ns for path in output.glob('*.safetensors')}
 
 
 def test_every_row_seed_and_sequence_is_there(done):
     with (done / 'ablation.csv').open() as file:
         rows = list(csv.DictReader(file))
-    assert tuple(dict.fromkeys(row['row'] for row in rows)) == TRAINED + UNLEARNED
+    assert tuple(dict.fromkeys(row['row'] for row in rows)) == TRAINED + REFERENCES
     seeds = {row: ['0', '1'] for row in TRAINED} | {'random': ['0', '1', '2']}
-    for name in TRAINED + UNLEARNED:
+    for name in TRAINED + REFERENCES:
         assert [(row['seed'], row['sequence']) for row in rows if row['row'] == name] == [
             (seed, text) for seed in seeds.get(name, ['']) for text in TESTED]
     value = {(row['row'], row['sequence']): float(row['ate_percent']) for row in rows}
@@ -93,43 +94,43 @@ def test_every_row_seed_and_sequence_is_there(done):
     assert kept['every'] == 1.0 > kept['random'] > kept['rail'] > kept['straight_line'] == 0.0
 
 
-def test_the_table_has_all_rows_and_the_curves_are_a_picture(done):
+def test_the_table_has_all_rows_and_the_curves_are_plotted(done):
     lines = (done / 'ablation.md').read_text().splitlines()
     assert [line.split('`')[1] for line in lines if line.startswith('| `')] \
-        == list(TRAINED + UNLEARNED)
+        == list(TRAINED + REFERENCES)
     assert sum('geometric mean over 2 sequences' in line for line in lines) == 1
     picture = cv2.imread(str(done / 'curves.png'))
     assert picture.shape[1] > 2 * picture.shape[0] and len(np.unique(picture)) > 50
 
 
-def test_a_teacher_has_a_row_of_its_own(folder):
+def test_the_expert_has_a_row_of_its_own(folder):
     recipe = read_training_config('train.yaml')
-    chosen = ablation._choose(ablation.AblationOptions(stop=30, cache=str(folder / 'cache')))
-    backbone = factory.make_backbone(chosen.odometry)
-    examination = ablation._examination(chosen, TESTED[:1], backbone)
-    outcomes = list(examination.unlearned(recipe))
-    assert [each.row for each in outcomes if each.row != 'random'] == [
-        *UNLEARNED[:3], 'teacher', *UNLEARNED[4:]]
-    taught = next(each for each in outcomes if each.row == 'teacher')
-    assert 0.0 < taught.kept <= 1.0 and taught.ate_percent > 0.0
+    setup = ablation._make_setup(ablation.AblationOptions(stop=30, cache=str(folder / 'cache')))
+    test = ablation._make_test(setup, TESTED[:1], factory.make_backbone(setup.odometry))
+    results = list(test.reference_results(recipe))
+    assert [each.row for each in results if each.row != 'random'] == [
+        *REFERENCES[:3], 'teacher', *REFERENCES[4:]]
+    expert = next(each for each in results if each.row == 'teacher')
+    assert 0.0 < expert.kept <= 1.0 and expert.ate_percent > 0.0
 
 
-def test_each_row_learned_what_it_says(done):
-    told = {row: read_policy(done / f'{row}-1.safetensors') for row in TRAINED}
+def test_each_row_is_trained_by_its_recipe(done):
+    policies = {row: read_policy(done / f'{row}-1.safetensors') for row in TRAINED}
     parts = {row: {name for name, _ in policy.signature.observation}
-             for row, policy in told.items()}
+             for row, policy in policies.items()}
     assert parts['full'] == {'descriptor', 'poses'}
     assert parts['local_signals_only'] and not parts['local_signals_only'] & parts['full']
-    assert [policy.training['recipe']['reward'] for policy in told.values()] == ['paper', 'local']
-    assert [policy.training['seed'] for policy in told.values()] == [1, 1]
-    assert read_training_config(str(done / 'full.yaml')) == row_config(
-        'full', read_training_config(str(done.parent / 'few.yaml')), 64)
-    command = told['full'].training['command']
+    assert [policy.training['recipe']['reward'] for policy in policies.values()] == [
+        'paper', 'local']
+    assert [policy.training['seed'] for policy in policies.values()] == [1, 1]
+    assert read_training_config(str(done / 'full.yaml')) == read_ablation_rows(
+        read_training_config(str(done.parent / 'few.yaml')), 64)['full']
+    command = policies['full'].training['command']
     assert command.startswith('python -m kfvo_ros.train synthetic:1:smooth synthetic:2:smooth')
     assert str(done / 'full.yaml') in command
 
 
-def test_curves_are_what_was_logged(done):
+def test_curves_hold_the_logged_values(done):
     curve = read_curve('full', 'paper', done / 'full-0.training')
     assert curve.errors[:, 0].tolist() == [32.0, 64.0]
     assert curve.returns[-1, 0] == 64.0  # by then an episode has ended
@@ -140,16 +141,16 @@ def test_curves_are_what_was_logged(done):
                                 for name in ('every', 'optical_flow', 'survival')}
 
 
-def test_what_is_complete_is_not_trained_again(folder, done, tmp_path, capsys):
+def test_a_complete_training_is_not_repeated(folder, done, tmp_path, capsys):
     output = tmp_path / 'again'
     shutil.copytree(done, output)
     (output / 'full-1.safetensors').unlink()
     shutil.rmtree(output / 'full-1.training')
     before, recipe = files(output), (output / 'local_signals_only.yaml').stat()
     first = output / 'full-0.training' / 'last.safetensors'
-    told = read_policy(first)
-    replace(told, training={name: value for name, value in told.training.items()
-                            if name != 'reading'}).write(first)  # as an older version did
+    policy = read_policy(first)
+    replace(policy, training={key: value for key, value in policy.training.items()
+                              if key != 'reading'}).write(first)  # as an older version did
     assert run(folder, output, '--resume') == 0
     assert (output / 'local_signals_only.yaml').stat() == recipe
     assert capsys.readouterr().out.count(' is complete\n') == 3
@@ -159,7 +160,7 @@ def test_what_is_complete_is_not_trained_again(folder, done, tmp_path, capsys):
         assert (output / name).read_bytes() == (done / name).read_bytes()
 
 
-def test_a_training_that_is_not_complete_goes_on(folder, tmp_path, capsys):
+def test_an_incomplete_training_is_resumed(folder, tmp_path, capsys):
     one = ('--rows', 'without_pose', '--seeds', 0)
     assert run(folder, tmp_path, *one, '--steps', 32) == 0
     assert run(folder, tmp_path, *one, '--resume') == 0
@@ -174,8 +175,8 @@ def test_a_training_that_is_not_complete_goes_on(folder, tmp_path, capsys):
      '30, now 25'),
     ('full-0.training/checkpoint.pt', ['--recipe', 'other.yaml'],
      'full-0.safetensors is of another training, or has lost its checkpoint')])
-def test_of_another_training_nothing_is_resumed(folder, done, tmp_path, capsys, monkeypatch, lost,
-                                                others, words):
+def test_another_training_is_not_resumed(folder, done, tmp_path, capsys, monkeypatch, lost, others,
+                                         words):
     output = tmp_path / 'other'
     shutil.copytree(done, output)
     if lost:
@@ -190,7 +191,7 @@ def test_of_another_training_nothing_is_resumed(folder, done, tmp_path, capsys, 
         assert (output / f'{row}.yaml').read_bytes() == (done / f'{row}.yaml').read_bytes()
 
 
-def test_nothing_is_overwritten_unasked(folder, done, tmp_path, capsys):
+def test_nothing_is_overwritten_by_default(folder, done, tmp_path, capsys):
     before = files(done)
     assert run(folder, done) == 1
     assert 'full-0.safetensors is there already' in capsys.readouterr().err
@@ -216,7 +217,7 @@ def test_bad_arguments_are_refused_in_one_line(arguments, words, capsys, tmp_pat
 
 
 @pytest.mark.parametrize('missing', ['--test', '--validation', '--output'])
-def test_what_is_missing_is_named(missing, capsys):
+def test_a_missing_argument_is_named(missing, capsys):
     given = {'--test': 'synthetic:4', '--validation': 'synthetic:3', '--output': 'here'}
     with pytest.raises(SystemExit) as stopped:
         ablation.main(['synthetic:1', *(text for name, value in given.items() if name != missing
@@ -225,21 +226,51 @@ def test_what_is_missing_is_named(missing, capsys):
     assert capsys.readouterr().err.splitlines()[-1].endswith(f'required: {missing}')
 
 
-def test_rows_differ_from_full_in_one_thing():
+def test_rows_differ_from_full_in_one_key():
     recipe = read_training_config('train.yaml')
-    rows = {name: row_config(name, recipe, 80_000) for name in ROWS}
+    rows = read_ablation_rows(recipe, 80_000)
+    assert list(rows) == ['full', 'without_pose', 'without_descriptor', 'without_alpha',
+                          'alpha_penalty', 'local', 'local_signals_only', 'local_untaught']
     full = vars(rows['full'])
-    assert (full['reward'], full['alpha'], full['without']) == ('paper', ALPHA, ('signals',))
-    changed = {name: {key: value for key, value in vars(rows[name]).items() if value != full[key]}
-               for name in ROWS}
-    assert changed['without_pose'] == {'without': ('poses', 'signals')}
-    assert changed['without_descriptor'] == {'without': ('descriptor', 'signals')}
-    assert changed['without_alpha'] == {'alpha': 0.0}
-    assert changed['alpha_penalty'] == {'alpha': -2.5e-5}
-    assert rows['local'] == row_config('local', recipe, 80_000)
+    assert (full['reward'], full['alpha'], full['without'], full['expert']) == (
+        'paper', ALPHA, ('signals',), None)
+    assert (full['steps'], full['validation_every']) == (80_000, 10_000)
+
+    def changed(row: str, other: str) -> dict[str, object]:
+        return {key: value for key, value in vars(rows[row]).items()
+                if value != vars(rows[other])[key]}
+
+    assert changed('without_pose', 'full') == {'without': ('poses', 'signals')}
+    assert changed('without_descriptor', 'full') == {'without': ('descriptor', 'signals')}
+    assert changed('without_alpha', 'full') == {'alpha': 0.0}
+    assert changed('alpha_penalty', 'full') == {'alpha': -2.5e-5}
     assert {key for key, value in vars(rows['local']).items() if value != vars(recipe)[key]} \
         == {'steps', 'validation_every', 'without'}
-    assert {key for key in full if vars(rows['local_signals_only'])[key]
-            != vars(rows['local'])[key]} == {'without'}
-    assert {key for key in full if vars(rows['local_untaught'])[key]
-            != vars(rows['local_signals_only'])[key]} == {'teacher'}
+    assert changed('local_signals_only', 'local') == {'without': ('descriptor', 'poses')}
+    assert changed('local_untaught', 'local_signals_only') == {'expert': None}
+
+
+@pytest.mark.parametrize(('rows', 'words'), [
+    ('near: {rewards: paper}', 'near: expected the keys steps, environments'),
+    ('near: {ppo: {gama: 0.5}}', "near.ppo: expected the keys n_steps, batch_size"),
+    ('near: {reward: praise}', 'near.reward: expected one of local, paper; came'),
+    ('near: {imitation: null}', 'near.imitation: expected how the teacher is imitated'),
+    ('near: paper', 'near: expected the keys steps, environments'),
+    ('[near, far]', 'expected rows with the keys that they change; came'),
+    ('near: [', 'cannot read the rows ablation.yaml')])
+def test_a_wrong_row_is_one_clear_line(rows, words, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'ablation.yaml').write_text(rows)
+    with pytest.raises(KfvoError) as refusal:
+        read_ablation_rows(read_training_config('train.yaml'), 64)
+    line = str(refusal.value)
+    assert 'ablation.yaml: ' in line and words in line and '\n' not in line
+
+
+def test_rows_may_change_nested_keys(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'ablation.yaml').write_text('far: {ppo: {gamma: 0.5}, steps: 9}\nsame: {}\n')
+    recipe = read_training_config('train.yaml')
+    rows = read_ablation_rows(recipe, 64)
+    assert rows['same'] == replace(recipe, steps=64, validation_every=8)
+    assert rows['far'] == replace(rows['same'], steps=9, ppo=replace(recipe.ppo, gamma=0.5))

@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The presets, calibrations and launch file that are installed."""
+"""Presets, calibrations, launch file and views that are installed."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ PRESETS = ('euroc', 'tum', 'kitti')
 
 
 @pytest.mark.parametrize('name', PRESETS)
-def test_preset_sets_parameters_that_exist(name: str) -> None:
+def test_presets_set_existing_parameters(name: str) -> None:
     preset = yaml.safe_load((ROOT / 'config' / f'{name}.yaml').read_text())
     values = preset['/**']['ros__parameters']
     assert values['image_topic'].startswith('/')
@@ -37,12 +37,12 @@ def test_preset_sets_parameters_that_exist(name: str) -> None:
 
 
 @pytest.mark.parametrize('number', sorted(FREIBURG))
-def test_tum_calibrations_are_those_of_its_reader(number: str) -> None:
+def test_tum_calibrations_equal_those_of_the_reader(number: str) -> None:
     read = read_camera_info(ROOT / 'config' / f'tum_freiburg{number}.yaml')
     assert read == FREIBURG[number]
 
 
-def test_a_file_of_the_config_folder_is_found_from_anywhere(
+def test_find_config_searches_the_config_folder(
         tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert find_config('euroc_cam0.yaml').samefile(ROOT / 'config' / 'euroc_cam0.yaml')
@@ -51,7 +51,7 @@ def test_a_file_of_the_config_folder_is_found_from_anywhere(
     assert find_config('euroc_cam0.yaml').samefile(tmp_path / 'euroc_cam0.yaml')
 
 
-def test_an_installed_config_folder_is_found(tmp_path: Path,
+def test_find_config_searches_installed_prefixes(tmp_path: Path,
                                              monkeypatch: pytest.MonkeyPatch) -> None:
     installed = tmp_path / 'share' / 'kfvo_ros' / 'config' / 'of_my_robot.yaml'
     installed.parent.mkdir(parents=True)
@@ -61,7 +61,7 @@ def test_an_installed_config_folder_is_found(tmp_path: Path,
 
 
 class FakeLaunch:
-    """Stands for the modules of launch, which has no wheels: records what is constructed."""
+    """Replaces classes of launch, which has no wheels, and records their arguments."""
 
     def __init__(self, *arguments: object, **keywords: object) -> None:
         self.arguments, self.keywords = arguments, keywords
@@ -73,7 +73,7 @@ class FakeLaunch:
 
 @pytest.fixture
 def launch_file(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """Return the launch file as a module, with recording stand-ins for launch."""
+    """Return the launch file as a module, with FakeLaunch for the classes of launch."""
     names = ('Action', 'DeclareLaunchArgument', 'ExecuteProcess', 'OpaqueFunction', 'IfCondition',
              'LaunchConfiguration', 'Node', 'LaunchContext', 'LaunchDescription')
     classes = {name: type(name, (FakeLaunch,), {}) for name in names}
@@ -115,7 +115,7 @@ def test_launch_arguments_reach_the_node_in_their_types(launch_file: Any) -> Non
     ('window_size', '2', 'a whole number of at least 3 and at most 32'),
     ('keyframes', 'often', 'one of every, optical_flow, survival'),
     ('publish_tf', 'perhaps', 'true or false'), ('scale', 'nan', 'a number of at least')])
-def test_a_wrong_launch_argument_is_named(launch_file: Any, name: str, text: str,
+def test_an_invalid_launch_argument_is_an_error(launch_file: Any, name: str, text: str,
                                           expected: str) -> None:
     given = dict.fromkeys((*launch_file.PARAMETERS, *launch_file.OTHERS), '') | {name: text}
     with pytest.raises(RuntimeError) as error:
@@ -124,7 +124,7 @@ def test_a_wrong_launch_argument_is_named(launch_file: Any, name: str, text: str
     assert repr(text) in str(error.value)
 
 
-def test_the_documented_parameters_are_those_of_the_node() -> None:
+def test_documented_parameters_equal_those_of_the_node() -> None:
     lines = (ROOT / 'docs' / 'parameters.md').read_text().splitlines()
     rows = [[cell.strip(' `') for cell in line.split(' | ')] for line in lines
             if line.startswith('| `')]
@@ -138,21 +138,21 @@ def test_the_documented_parameters_are_those_of_the_node() -> None:
         assert text.replace('`', '') == each.description + choices
 
 
-def test_rviz_shows_what_the_node_publishes() -> None:
+def test_rviz_shows_the_topics_of_the_node() -> None:
     text = (ROOT / 'rviz' / 'kfvo.rviz').read_text()
     displays = yaml.safe_load(text)['Visualization Manager']['Displays']
     topics = {display['Topic']['Value'] for display in displays if 'Topic' in display}
     assert topics == {'/kfvo/odometry', '/kfvo/path'}
 
 
-def test_foxglove_layout_has_a_place_for_every_panel() -> None:
-    """Which topics they show, test_node compares with what the node publishes."""
+def test_foxglove_layout_contains_every_panel() -> None:
+    """test/ros compares the topics with those of the node."""
     layout = json.loads((ROOT / 'foxglove' / 'kfvo.json').read_text())
 
-    def places(part: str | dict) -> list[str]:
-        return [part] if isinstance(part, str) else [*places(part['first']),
-                                                     *places(part['second'])]
+    def panels(part: str | dict) -> list[str]:
+        return [part] if isinstance(part, str) else [*panels(part['first']),
+                                                     *panels(part['second'])]
 
-    assert sorted(places(layout['layout'])) == sorted(layout['configById'])
+    assert sorted(panels(layout['layout'])) == sorted(layout['configById'])
     scene = layout['configById']['3D!kfvo']
     assert (scene['followTf'], scene['layers']['grid']['frameId']) == ('odom', 'odom')

@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The package around the code: what is installed, what is declared, and who imports whom."""
+"""Packaging: layers of imports, missing dependencies, installed files, declarations."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ HEADER = ['# Copyright 2026 The kfvo_ros authors', '# SPDX-License-Identifier: A
 BUILT = ('.git', '.venv*', '*.egg-info', '__pycache__', '.*_cache', 'build', 'install', 'log',
          'demo', 'results')
 
-# Rooms by floor, the ground first; modules that are not named stand on the ground.
-FLOORS = ((), ('tracking', 'sequences'), ('backbones', 'keyframes'), ('odometry',),
+# Rooms by layer, the lowest first; modules that are not named are in the lowest.
+LAYERS = ((), ('tracking', 'sequences'), ('backbones', 'keyframes'), ('odometry',),
           ('evaluation', 'training', 'ros'),
           ('benchmark', 'convert', 'demo', 'node', 'play', 'run', 'train'),
           ('ablation',))
 HEAVY = ('rclpy', 'torch', 'scipy', 'stable_baselines3')
-MAY_BE_HEAVY = ('kfvo_ros.ros', 'kfvo_ros.training', 'kfvo_ros.backbones.vggt')
+MAY_IMPORT_HEAVY = ('kfvo_ros.ros', 'kfvo_ros.training', 'kfvo_ros.backbones.vggt')
 
 
 def module_name(path: Path) -> str:
@@ -48,7 +48,7 @@ def module_name(path: Path) -> str:
 
 
 def imported_modules(path: Path) -> Iterator[str]:
-    """Yield all that a file imports, at its top or inside functions, as dotted names."""
+    """Yield the dotted names of all imports of a file, also inside functions."""
     for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -62,20 +62,20 @@ def canonical(distribution: str) -> str:
     return re.sub(r'[-_.]+', '-', distribution).lower()
 
 
-def floor_of(module: str) -> int:
-    """Return the floor of ``kfvo_ros`` or ``kfvo_ros.room...``."""
+def layer_of(module: str) -> int:
+    """Return the layer of ``kfvo_ros`` or ``kfvo_ros.room...``."""
     room = module.partition('.')[2].partition('.')[0]
-    return next((floor for floor, rooms in enumerate(FLOORS) if room in rooms), 0)
+    return next((layer for layer, rooms in enumerate(LAYERS) if room in rooms), 0)
 
 
-# Who imports whom
+# Layers
 
 
 def test_imports_point_down_only() -> None:
     wrong = [f'{module_name(path)} imports {imported}' for path in SOURCES
              for imported in imported_modules(path)
              if imported.startswith('kfvo_ros.') and module_name(path) != 'kfvo_ros'
-             and floor_of(imported) > floor_of(module_name(path))]
+             and layer_of(imported) > layer_of(module_name(path))]
     assert not wrong
 
 
@@ -86,16 +86,16 @@ def test_only_the_ros_folder_imports_rclpy() -> None:
 
 
 def test_core_imports_without_ros_torch_and_scipy() -> None:
-    core = [name for name in map(module_name, SOURCES) if not name.startswith(MAY_BE_HEAVY)]
+    core = [name for name in map(module_name, SOURCES) if not name.startswith(MAY_IMPORT_HEAVY)]
     assert 'kfvo_ros.camera' in core
     code = ('import importlib, sys\n'
             f'sys.modules.update(dict.fromkeys({HEAVY}))\n'
             'for name in sys.argv[1:]: importlib.import_module(name)')
-    outcome = run_python('-c', code, *core)
-    assert outcome.returncode == 0, outcome.stderr
+    done = run_python('-c', code, *core)
+    assert done.returncode == 0, done.stderr
 
 
-def test_a_node_without_vggt_does_without_torch() -> None:
+def test_a_node_without_vggt_imports_no_torch() -> None:
     if importlib.util.find_spec('rclpy') is None:
         pytest.skip("rclpy is not installed: source a ROS 2 or pip install '.[ros]'")
     code = ('import sys\n'
@@ -105,16 +105,16 @@ def test_a_node_without_vggt_does_without_torch() -> None:
             'odometry = make_odometry(OdometryOptions())\n'
             'assert (odometry.backbone.name, odometry.policy.name) == ("geometric", "learned")\n'
             'print(*sys.modules)')
-    outcome = run_python('-c', code)
-    assert outcome.returncode == 0, outcome.stderr
-    loaded = set(outcome.stdout.split())
+    done = run_python('-c', code)
+    assert done.returncode == 0, done.stderr
+    loaded = set(done.stdout.split())
     assert 'rclpy' in loaded and not loaded & {'torch', 'PIL', 'huggingface_hub'}
 
 
-# A missing dependency
+# Missing dependencies
 
 
-def test_missing_module_names_its_pip_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_dependency_names_its_pip_command(monkeypatch: pytest.MonkeyPatch) -> None:
     imported = {root for path in SOURCES for name in imported_modules(path)
                 for root in [name.split('.')[0]]} - sys.stdlib_module_names - {'kfvo_ros'}
     installed = importlib.metadata.packages_distributions()
@@ -131,7 +131,7 @@ def test_missing_module_names_its_pip_line(monkeypatch: pytest.MonkeyPatch) -> N
     assert {'opencv-python-headless', 'pyyaml', 'numpy', 'torch', 'pillow'} <= named
 
 
-def test_missing_module_of_ours_stays_an_error() -> None:
+def test_a_missing_module_of_the_package_stays_an_import_error() -> None:
     with pytest.raises(ModuleNotFoundError) as caught:
         importlib.import_module('kfvo_ros.no_such_module')
     with pytest.raises(ModuleNotFoundError, match='no_such_module'):
@@ -139,16 +139,16 @@ def test_missing_module_of_ours_stays_an_error() -> None:
 
 
 @pytest.mark.parametrize('module', ['numpy', 'poselib'])
-def test_run_names_a_missing_package(module: str, tmp_path: Path) -> None:
+def test_run_names_a_missing_dependency(module: str, tmp_path: Path) -> None:
     code = ('import sys\n'
             f'sys.modules[{module!r}] = None\n'
             'from kfvo_ros.run import main\n'
             'sys.exit(main(["synthetic:0", "--stop", "2", "--output", sys.argv[1]]))')
-    outcome = run_python('-c', code, tmp_path)
-    assert_one_readable_line(outcome, f'{module} is missing: pip install {module}')
+    done = run_python('-c', code, tmp_path)
+    assert_one_readable_line(done, f'{module} is missing: pip install {module}')
 
 
-# What colcon installs
+# Installation by colcon
 
 
 @pytest.fixture(scope='module')
@@ -159,20 +159,20 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp('workspace')
     source = folder / 'src' / 'kfvo_ros'
     shutil.copytree(ROOT, source, ignore=shutil.ignore_patterns(*BUILT))
-    # One file in each folder that setup.py installs, whether it holds something yet or not.
+    # An extra file in each folder that setup.py installs.
     for name in ('config', 'launch', 'rviz', 'foxglove'):
         (source / name).mkdir(exist_ok=True)
         (source / name / 'probe').touch()
-    outcome = subprocess.run([sys.executable, '-m', 'colcon', 'build'], cwd=folder, text=True,
+    done = subprocess.run([sys.executable, '-m', 'colcon', 'build'], cwd=folder, text=True,
                              env={**os.environ, 'COLCON_HOME': str(folder)}, timeout=300,
                              capture_output=True, check=False)
-    assert outcome.returncode == 0, outcome.stdout + outcome.stderr
+    assert done.returncode == 0, done.stdout + done.stderr
     return folder
 
 
 @pytest.fixture(scope='module')
 def distribution(workspace: Path) -> importlib.metadata.Distribution:
-    """Return what setup.py declares, as it was installed."""
+    """Return the metadata of the installed package."""
     site_packages = next(workspace.glob('install/kfvo_ros/lib/python3*/site-packages'))
     return next(iter(importlib.metadata.distributions(name='kfvo_ros', path=[str(site_packages)])))
 
@@ -213,8 +213,10 @@ def test_installed_files(workspace: Path) -> None:
     assert (share / 'package.xml').is_file()
     for folder in ('config', 'launch', 'rviz', 'foxglove'):
         assert (share / folder / 'probe').is_file()
-    assert (next(installed.glob('lib/python3*/site-packages')) / 'kfvo_ros' / 'evaluation'
-            / 'published.yaml').is_file()
+    package = next(installed.glob('lib/python3*/site-packages')) / 'kfvo_ros'
+    assert (package / 'evaluation' / 'published.yaml').is_file()
+    assert (package / 'keyframes' / 'geometric.safetensors').is_file()
+    assert (package / 'py.typed').is_file()
     scripts = {path.name: path for path in (installed / 'lib' / 'kfvo_ros').iterdir()}
     assert set(scripts) == set(COMMANDS)
     for script in scripts.values():
@@ -223,10 +225,10 @@ def test_installed_files(workspace: Path) -> None:
 
 
 @pytest.mark.parametrize(('command', 'word'), COMMANDS.items())
-def test_installed_command_starts(command: str, word: str, workspace: Path) -> None:
-    outcome = start(workspace, command, '--help')
-    assert outcome.returncode == 0, outcome.stderr
-    assert word in outcome.stdout
+def test_installed_commands_start(command: str, word: str, workspace: Path) -> None:
+    done = start(workspace, command, '--help')
+    assert done.returncode == 0, done.stderr
+    assert word in done.stdout
 
 
 # Files
@@ -247,13 +249,13 @@ def test_camera_of_the_euroc_bags() -> None:
     assert camera.distortion[:4] == (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05)
 
 
-def test_ros_wheels_make_messages() -> None:
+def test_ros_messages_are_serialised() -> None:
     if importlib.util.find_spec('rclpy') is None:
         pytest.skip("rclpy is not installed: source a ROS 2 or pip install '.[ros]'")
-    outcome = run_python('-c', 'import rclpy\n'
+    done = run_python('-c', 'import rclpy\n'
                          'from nav_msgs.msg import Odometry, Path\n'
                          'from rclpy.serialization import deserialize_message, serialize_message\n'
                          'message = Odometry(child_frame_id="camera_body")\n'
                          'again = deserialize_message(serialize_message(message), Odometry)\n'
                          'assert again == message')
-    assert outcome.returncode == 0, outcome.stderr
+    assert done.returncode == 0, done.stderr

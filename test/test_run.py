@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""``python -m kfvo_ros.run`` as users start it: files, exit status, errors, interruption."""
+"""``python -m kfvo_ros.run`` as a process: files, exit status, errors, interruption."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def finished(images, tmp_path_factory) -> tuple[Path, subprocess.CompletedProces
     return output, command(images, '--output', output, '--keyframes', 'survival')
 
 
-def test_files_and_summary(images, finished):
+def test_files_and_summary_of_a_run(images, finished):
     output, done = finished
     assert done.returncode == 0, done.stderr
     assert sorted(path.name for path in output.iterdir()) == [
@@ -71,12 +71,12 @@ def test_files_and_summary(images, finished):
     assert summary['extent'] > 0.0
     assert summary['max_rotation_deg'] > 0.0
     assert 0.2 < summary['median_depth'] < 5.0
-    assert 'ate_rmse_m' not in summary  # nobody measured the truth
+    assert 'ate_rmse_m' not in summary  # no ground truth
     assert 'ended_early' not in summary
     assert f'{COUNT} frames' in done.stdout
 
 
-def test_trajectory_has_a_line_per_frame(images, finished):
+def test_trajectory_has_one_line_per_frame(images, finished):
     output, _ = finished
     lines = (output / 'trajectory.tum').read_text().splitlines()
     assert all(POSE.fullmatch(line) for line in lines)
@@ -96,13 +96,13 @@ def test_memory_is_small(finished):
     assert json.loads((finished[0] / 'summary.json').read_text())['peak_rss_mb'] <= 250.0
 
 
-def test_same_seed_same_bytes_and_nothing_is_overwritten_unasked(images, finished, tmp_path):
+def test_same_seed_gives_same_bytes_and_results_are_not_overwritten(images, finished, tmp_path):
     first = (finished[0] / 'trajectory.tum').read_bytes()
     again = command(images, '--output', tmp_path, '--keyframes', 'survival', '--seed', 0)
     assert again.returncode == 0
     assert (tmp_path / 'trajectory.tum').read_bytes() == first
-    refused = command(images, '--output', tmp_path, '--stop', 3)
-    assert_one_readable_line(refused, 'trajectory.tum', '--overwrite')
+    rejected = command(images, '--output', tmp_path, '--stop', 3)
+    assert_one_readable_line(rejected, 'trajectory.tum', '--overwrite')
     assert (tmp_path / 'trajectory.tum').read_bytes() == first
     replaced = command(images, '--output', tmp_path, '--stop', 3, '--overwrite')
     assert replaced.returncode == 0
@@ -126,19 +126,19 @@ def test_ground_truth_and_options(tmp_path):
 
 
 @pytest.mark.parametrize('sent', [signal.SIGINT, signal.SIGTERM])
-def test_interruption_keeps_what_was_computed(sent, tmp_path):
+def test_interruption_keeps_the_results_so_far(sent, tmp_path):
     trajectory = tmp_path / 'trajectory.tum'
-    status, _, problems = run_interrupted(
+    status, _, errors = run_interrupted(
         sent, lambda: trajectory.exists() and trajectory.read_text().count('\n') >= 3,
         '-m', 'kfvo_ros.run', 'synthetic:1:fast', '--output', tmp_path, '--keyframes', 'every')
     assert status == 1
-    assert 'Traceback' not in problems
-    assert 'interrupted' in problems.splitlines()[-1]
+    assert 'Traceback' not in errors
+    assert 'interrupted' in errors.splitlines()[-1]
     summary = json.loads((tmp_path / 'summary.json').read_text())
     assert summary['ended_early'] == 'interrupted'
     lines = trajectory.read_text().splitlines()
     assert all(POSE.fullmatch(line) for line in lines)
-    # Those in the window count too: a line for each frame that was processed.
+    # There is a line for each processed frame, including those in the window.
     assert 10 <= len(lines) == summary['frames'] < 200
     assert len(lines) == len((tmp_path / 'keyframes.tum').read_text().splitlines())
 
@@ -152,25 +152,25 @@ def test_interruption_keeps_what_was_computed(sent, tmp_path):
     (['synthetic:1', '--kind', 'nothing'], ['nothing', 'euroc']),
     (['synthetic:1', '--camera', '/no/such.yaml'], ['/no/such.yaml']),
 ])
-def test_what_cannot_be_is_told_in_one_line(arguments, parts, tmp_path):
+def test_invalid_arguments_are_errors_of_one_line(arguments, parts, tmp_path):
     done = command(*arguments, '--output', tmp_path / 'out')
     assert_one_readable_line(done, *parts)
     assert not (tmp_path / 'out').exists()
 
 
-@pytest.mark.parametrize('broken', ['noise', 'cut', 'size', 'empty'])
-def test_a_broken_image_in_the_middle_keeps_the_earlier_frames(broken, images, tmp_path):
+@pytest.mark.parametrize('corruption', ['noise', 'cut', 'size', 'empty'])
+def test_a_corrupt_image_keeps_the_earlier_frames(corruption, images, tmp_path):
     folder, output = tmp_path / 'in', tmp_path / 'out'
     folder.mkdir()
     for path in images.iterdir():
         (folder / path.name).write_bytes(path.read_bytes())
     bad = folder / '11.png'
-    if broken == 'size':
+    if corruption == 'size':
         cv2.imwrite(str(bad), np.zeros((100, 100), dtype=np.uint8))
     else:
         content = bad.read_bytes()
         bad.write_bytes({'noise': b'no image at all', 'empty': b'',
-                         'cut': content[:40]}[broken])
+                         'cut': content[:40]}[corruption])
     done = command(folder, '--output', output)
     assert_one_readable_line(done, '11.png')
     assert done.returncode == 1
@@ -180,20 +180,20 @@ def test_a_broken_image_in_the_middle_keeps_the_earlier_frames(broken, images, t
     assert '11.png' in summary['ended_early']
 
 
-def test_output_that_cannot_be_written(images, tmp_path):
+def test_an_output_folder_that_cannot_be_created(images, tmp_path):
     (tmp_path / 'file').write_text('in the way')
     assert_one_readable_line(command(images, '--output', tmp_path / 'file' / 'out'), 'file')
 
 
 def test_a_full_disk(images, tmp_path):
-    """In the developers' mode Python tells of errors at its exit too."""
+    """In development mode Python reports errors at its exit too."""
     (tmp_path / 'trajectory.tum').symlink_to('/dev/full')
     done = command(images, '--output', tmp_path, '--overwrite',
                    env=ENVIRONMENT | {'PYTHONDEVMODE': '1'})
     assert_one_readable_line(done, f'cannot write to {tmp_path}', 'No space left on device')
 
 
-def test_wrong_rate(images, tmp_path):
+def test_an_invalid_rate(images, tmp_path):
     assert_one_readable_line(command(images, '--output', tmp_path / 'out', '--rate', 'inf'),
                              'inf')
 

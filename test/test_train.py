@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""``python -m kfvo_ros.train``: short trainings as users start them, and what comes of them."""
+"""``python -m kfvo_ros.train``: short trainings, their files, interruption and resumption."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from kfvo_ros import run, train
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.keyframes.learned import read_policy
 from kfvo_ros.training.plan import TrainingFiles
-from kfvo_ros.training.ppo import Training
+from kfvo_ros.training.ppo import Trainer
 from kfvo_ros.utils.files import find_config
 from kfvo_ros.utils.signals import SIGNALS
 
@@ -58,7 +58,7 @@ def arguments(folder: Path, *more: object) -> list[str]:
 
 @pytest.fixture(scope='module')
 def trained(folder) -> Path:
-    """Return the folder of a training that came to its end."""
+    """Return the folder of a complete training."""
     with pytest.MonkeyPatch.context() as patch:
         (folder / 'first').mkdir()
         patch.chdir(folder / 'first')
@@ -67,19 +67,19 @@ def trained(folder) -> Path:
 
 
 def scalars(folder: Path) -> dict[str, list[int]]:
-    """Return the steps at which each value was logged."""
+    """Return the steps at which each scalar was logged."""
     logs = EventAccumulator(str(folder / 'policy.training')).Reload()
     return {name: [event.step for event in logs.Scalars(name)]
             for name in logs.Tags()['scalars']}
 
 
 def open_logs() -> list[threading.Thread]:
-    """Return the threads that write logs."""
+    """Return the threads of TensorBoard writers."""
     return [each for each in threading.enumerate()
             if type(each).__module__.startswith('tensorboard')]
 
 
-def test_smoke_needs_nothing_else(tmp_path, monkeypatch, capsys):
+def test_smoke_needs_no_other_arguments(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert train.main(['--smoke', '--stop', '30', '--steps', '200', '--output',
                        'smoke.safetensors']) == 0
@@ -91,7 +91,7 @@ def test_smoke_needs_nothing_else(tmp_path, monkeypatch, capsys):
     assert not open_logs()
 
 
-def test_files_logs_and_what_the_policy_tells_of_itself(trained):
+def test_files_logs_and_metadata_of_the_policy(trained):
     assert {path.name.split('.')[0] for path in (trained / 'policy.training').iterdir()} == {
         'checkpoint', 'last', 'events'}
     logged = scalars(trained)
@@ -100,14 +100,16 @@ def test_files_logs_and_what_the_policy_tells_of_itself(trained):
     assert logged['validation_ate_percent/learned'] == [32, 64]
     assert {'rollout/keyframe_rate', 'rollout/ep_rew_mean', 'train/explained_variance',
             'train/value_loss', 'train/learning_rate', 'validation_kept/learned'} <= set(logged)
-    told = read_policy(trained / 'policy.training' / 'last.safetensors').training
-    assert (told['steps'], told['seed'], told['recipe']['ppo']['n_steps']) == (64, 0, 16)
-    assert told['sequences'] == ['synthetic:1:smooth', 'synthetic:2:smooth']
-    assert told['validation'] == ['synthetic:3:smooth']
-    assert (told['reading']['stop'], told['reading']['rate'], told['vggt']) == (25, 10.0, None)
-    assert told['command'].startswith('python -m kfvo_ros.train synthetic:1-2:smooth')
-    assert all(0.0 < told['scores'][name]['ate_percent'] < 50.0
-               and 0.1 < told['scores'][name]['kept'] <= 1.0
+    metadata = read_policy(trained / 'policy.training' / 'last.safetensors').training
+    assert (metadata['steps'], metadata['seed']) == (64, 0)
+    assert metadata['recipe']['ppo']['n_steps'] == 16
+    assert metadata['sequences'] == ['synthetic:1:smooth', 'synthetic:2:smooth']
+    assert metadata['validation'] == ['synthetic:3:smooth']
+    assert (metadata['reading']['stop'], metadata['reading']['rate']) == (25, 10.0)
+    assert metadata['vggt'] is None
+    assert metadata['command'].startswith('python -m kfvo_ros.train synthetic:1-2:smooth')
+    assert all(0.0 < metadata['scores'][name]['ate_percent'] < 50.0
+               and 0.1 < metadata['scores'][name]['kept'] <= 1.0
                for name in ('every', 'optical_flow', 'survival', 'learned'))
 
 
@@ -131,7 +133,7 @@ def test_a_policy_runs(trained, tmp_path):
     assert summary['keyframe_policy'] == 'learned' and summary['frames'] == 30
 
 
-def test_a_training_goes_on_where_it_ended(folder, trained, tmp_path, monkeypatch, capsys):
+def test_a_training_resumes_at_its_last_step(folder, trained, tmp_path, monkeypatch, capsys):
     shutil.copytree(trained, tmp_path / 'again')
     monkeypatch.chdir(tmp_path / 'again')
     before = torch.load('policy.training/checkpoint.pt', weights_only=True)
@@ -140,14 +142,15 @@ def test_a_training_goes_on_where_it_ended(folder, trained, tmp_path, monkeypatc
     after = torch.load('policy.training/checkpoint.pt', weights_only=True)
     assert (before['steps'], after['steps']) == (64, 96)
     assert after['best'] <= before['best']
-    adam = [each['parameters']['policy.optimizer']['state'][0]['step'] for each in (before, after)]
-    assert (adam[0], adam[1]) == (8, 12)  # two epochs of two batches per rollout of 32 steps
-    seen = [each['statistics']['observation']['count'] for each in (before, after)]
-    assert seen[1] - seen[0] == pytest.approx(34)  # the first observations, too
+    adam_steps = [each['parameters']['policy.optimizer']['state'][0]['step']
+                  for each in (before, after)]
+    assert adam_steps == [8, 12]  # two epochs of two batches per rollout of 32 steps
+    counts = [each['statistics']['observation']['count'] for each in (before, after)]
+    assert counts[1] - counts[0] == pytest.approx(34)  # the first observations, too
     assert scalars(Path())['train/learning_rate'] == [32, 64, 96]
 
 
-def test_without_a_best_policy_the_next_one_is_it(folder, trained, tmp_path, monkeypatch):
+def test_without_a_best_policy_the_next_one_is_the_best(folder, trained, tmp_path, monkeypatch):
     shutil.copytree(trained, tmp_path / 'again')
     monkeypatch.chdir(tmp_path / 'again')
     Path(POLICY).unlink()
@@ -155,7 +158,7 @@ def test_without_a_best_policy_the_next_one_is_it(folder, trained, tmp_path, mon
     assert read_policy(Path(POLICY)).training['steps'] == 64
 
 
-def test_sequences_read_otherwise_are_another_training(folder, trained, monkeypatch, capsys):
+def test_other_sequence_options_are_another_training(folder, trained, monkeypatch, capsys):
     monkeypatch.chdir(trained)
     assert train.main(arguments(folder, '--resume', '--stop', 30, '--rate', 5)) == 1
     line = capsys.readouterr().err.splitlines()[-1]
@@ -165,15 +168,15 @@ def test_sequences_read_otherwise_are_another_training(folder, trained, monkeypa
 @pytest.mark.parametrize('number', SIGNALS)
 def test_a_signal_to_all_processes_interrupts_and_saves(number, folder, trained, tmp_path,
                                                         monkeypatch, capsys):
-    after_update = Training.after_update
+    after_update = Trainer.after_update
 
-    def interrupted(training: Training, *arguments) -> None:
-        after_update(training, *arguments)
+    def interrupted(trainer: Trainer, *arguments) -> None:
+        after_update(trainer, *arguments)
         for process in multiprocessing.active_children():
             os.kill(process.pid, number)
         signal.raise_signal(number)
 
-    monkeypatch.setattr(Training, 'after_update', interrupted)
+    monkeypatch.setattr(Trainer, 'after_update', interrupted)
     monkeypatch.chdir(tmp_path)
     assert train.main(arguments(folder, '--workers', 2)) == 1
     line = capsys.readouterr().err.splitlines()[-1]
@@ -184,21 +187,21 @@ def test_a_signal_to_all_processes_interrupts_and_saves(number, folder, trained,
     assert not open_logs()
 
 
-def test_what_a_signal_ended_is_not_the_problem():
+def test_an_error_after_a_signal_is_an_interruption():
     saved = []
 
     def learn(display) -> None:
         signal.raise_signal(signal.SIGTERM)
         raise KfvoError('a worker process ended')
 
-    training = SimpleNamespace(steps=7, learn=learn, save=lambda: saved.append(7),
-                               plan=SimpleNamespace(recipe=SimpleNamespace(steps=9)))
+    trainer = SimpleNamespace(steps=7, learn=learn, save=lambda: saved.append(7),
+                              plan=SimpleNamespace(recipe=SimpleNamespace(steps=9)))
     with pytest.raises(KfvoError, match='^interrupted; .* holds the policy after 7 steps'):
-        train._learn(training, TrainingFiles(POLICY))
+        train._learn(trainer, TrainingFiles(POLICY))
     assert saved == [7]
 
 
-def test_what_was_learned_survives_an_interruption(folder, trained, tmp_path):
+def test_an_interruption_saves_policy_and_checkpoint(folder, trained, tmp_path):
     output = tmp_path / POLICY
     logs = tmp_path / 'policy.training'
     status, _, problems = run_interrupted(

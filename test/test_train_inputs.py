@@ -76,7 +76,8 @@ def test_a_sequence_without_truth_is_refused(without_truth, capsys):
     assert 'expected ground truth of the camera to learn from, none came' in line
 
 
-def test_such_a_training_sequence_is_refused_before_the_validation(without_truth, capsys, monkeypatch):
+def test_such_a_training_sequence_is_refused_before_validation(without_truth, capsys,
+                                                               monkeypatch):
     monkeypatch.setattr(train, '_make_validation', lambda *_: pytest.fail('too late'))
     line = refused(capsys, 'synthetic:1', without_truth, '--validation', 'synthetic:3')
     assert 'expected ground truth of the camera to learn from, none came' in line

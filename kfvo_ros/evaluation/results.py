@@ -24,7 +24,7 @@ TRAJECTORY, KEYFRAMES, SUMMARY = 'trajectory.tum', 'keyframes.tum', 'summary.jso
 
 
 class ResultWriter:
-    """Writes poses as they become final, and collects the numbers of the summary.
+    """Writes poses as they become final, and collects the values of the summary.
 
     Raises KfvoError if the folder holds results and `overwrite` is not set, and for any write
     error, now or later.
@@ -54,7 +54,7 @@ class ResultWriter:
         self._keyframe_count = 0
 
     def update(self, update: Update) -> None:
-        """Record what one frame changed."""
+        """Record the result of one frame."""
         self._statuses[update.status] += 1
         self._keyframe_count += update.is_keyframe
         if update.median_depth is not None:
@@ -113,7 +113,7 @@ class ResultWriter:
 
     @contextmanager
     def _writing_errors(self) -> Iterator[None]:
-        """Raise a KfvoError for a write error, also at every later call: a line may be cut."""
+        """Raise KfvoError for a write error, also in later calls: a line may be incomplete."""
         if self._failure is not None:
             raise self._failure
         try:
@@ -126,7 +126,7 @@ class ResultWriter:
             raise self._failure from error
 
     def _milliseconds(self) -> dict[str, dict[str, float]]:
-        """Return median and 95th percentile [ms] of each step, of their sum, and of parts."""
+        """Return median and 95th percentile [ms] of each step, of their sum and of their parts."""
         steps = {step: np.array(values) for step, values in self._durations.items()}
         if steps:
             steps['total'] = np.sum(list(steps.values()), axis=0)
@@ -137,7 +137,7 @@ class ResultWriter:
 
 
 def evaluate(estimate: Trajectory, truth: GroundTruth | None) -> dict[str, Any]:
-    """Return the accuracy fields of the summary; ``ground_truth_problem`` where there are none."""
+    """Return the accuracy fields of the summary, else ``ground_truth_problem``."""
     if truth is None:
         return {}
     try:

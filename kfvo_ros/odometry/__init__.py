@@ -1,3 +1,3 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The method: keyframe odometry, and its online and offline results."""
+"""Keyframe odometry: the method, its options and its online form."""

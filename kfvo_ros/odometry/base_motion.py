@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Motion of the robot base from that of its camera: poses, twists and covariances for ROS.
+"""Pose, twist and covariances of the robot base from those of its camera.
 
 T_base_camera is fixed and odom is the base at the first image, as world is the camera there:
 T_odom_base = T_base_camera T_world_camera T_base_camera^-1. The base has the axes of REP-103:
@@ -44,7 +44,7 @@ def base_pose(T_world_camera: np.ndarray, T_base_camera: np.ndarray) -> np.ndarr
 
 
 def base_motion(pose: OnlinePose, T_base_camera: np.ndarray) -> BaseMotion:
-    """Return the motion of the base for a pose of the camera; no twist without a motion."""
+    """Return the motion of the base; without a camera motion its twist is zero and unknown."""
     T_odom_base = base_pose(pose.T_world_camera, T_base_camera)
     adjoint = _adjoint(T_base_camera, T_odom_base)
     covariance = adjoint @ pose.covariance @ adjoint.T

@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Working parts from options: backbone, keyframe policy, odometry, sequence."""
+"""Construct backbone, keyframe policy, odometry and sequence from their options."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from kfvo_ros.sequences.base import Sequence
 
 
 def make_backbone(options: OdometryOptions, vggt: VggtOptions | None = None) -> Backbone:
-    """Return the backbone of `options`, ready for its first frame; raises KfvoError."""
+    """Return the backbone that `options` name; raises KfvoError."""
     if options.backbone == 'vggt':
         from kfvo_ros.backbones.vggt.backbone import load_backbone
         vggt = vggt or VggtOptions()
@@ -42,7 +42,7 @@ def make_backbone(options: OdometryOptions, vggt: VggtOptions | None = None) -> 
 def make_policy(options: OdometryOptions, backbone: Backbone) -> KeyframePolicy:
     """Return the keyframe policy of `options` for this backbone; raises KfvoError.
 
-    Without a choice it is the learned policy if one fits, else `Survival`.
+    The default is the learned policy of the backbone where its signature matches, else `Survival`.
     """
     if options.policy is not None and options.keyframes not in (None, 'learned'):
         raise KfvoError(f'the policy file {options.policy} is for keyframes learned, came '
@@ -87,9 +87,9 @@ def signature_of(options: OdometryOptions, backbone: Backbone) -> PolicySignatur
 
 def make_odometry(options: OdometryOptions | None = None, backbone: Backbone | None = None,
                   vggt: VggtOptions | None = None) -> KeyframeOdometry:
-    """Return the odometry of `options`; None stands for the defaults of each argument.
+    """Return the odometry of `options`; None means the defaults. Raises KfvoError.
 
-    A `backbone` that exists already can serve many odometries. Raises KfvoError.
+    Several odometries can share one `backbone`.
     """
     options = options or OdometryOptions()
     backbone = backbone or make_backbone(options, vggt)
@@ -98,7 +98,7 @@ def make_odometry(options: OdometryOptions | None = None, backbone: Backbone | N
 
 
 def make_sequence(text: str, options: SequenceOptions) -> Sequence:
-    """Open a sequence as `options` say; raises KfvoError."""
+    """Return the sequence of a path or ``synthetic:SEED[:STYLE]``; raises KfvoError."""
     return open_sequence(
         text, kind=options.kind, image_topic=options.image_topic,
         camera=read_camera_info(Path(options.camera)) if options.camera else None,
@@ -108,7 +108,7 @@ def make_sequence(text: str, options: SequenceOptions) -> Sequence:
 
 
 def parse_transform(text: str | None) -> np.ndarray | None:
-    """Return T (4, 4) of ``x y z qx qy qz qw``; raises KfvoError."""
+    """Return the transform (4, 4) of ``x y z qx qy qz qw``, None of None; raises KfvoError."""
     if text is None:
         return None
     try:

@@ -43,7 +43,7 @@ WINDOW_SIZE = 8
 MAX_LOST_FRAMES = 5
 """After this many lost frames in a row the window restarts at the last known pose."""
 MAX_PENDING = 1000
-"""Poses that may wait for their keyframe; a camera at rest adds none, so older ones are final."""
+"""Maximum of pending poses: a camera at rest adds no keyframes, so older poses become final."""
 
 
 class KeyframeOdometry:
@@ -105,13 +105,13 @@ class KeyframeOdometry:
         return Window(stream, tuple(frame.encoded for frame in self.window), self._prior)
 
     def integrate(self, estimate: Estimate | None) -> Step:
-        """Align, chain and observe (steps 3 to 5); `estimate` is None where `encode` said so."""
+        """Align, chain and observe (steps 3 to 5); `estimate` is None without a window."""
         if estimate is None:
             self._step = self._start_segment()
         elif estimate.status is Status.LOST:
             self._step = self._hold(estimate)
         else:
-            self._step = self._place(estimate)
+            self._step = self._advance(estimate)
         return self._step
 
     def commit(self, keep: bool, durations: dict[str, float]) -> Update:
@@ -127,7 +127,7 @@ class KeyframeOdometry:
                       durations, step.intrinsics, step.durations)
 
     def finish(self) -> tuple[FramePose, ...]:
-        """Return the frames whose poses were not final yet; now they are."""
+        """Return the pending frames; their poses are final now."""
         final = (*self._final, *self._pending)
         self._final.clear()
         self._pending.clear()
@@ -150,7 +150,7 @@ class KeyframeOdometry:
         return tuple(self._pending)
 
     def _track(self, frame: Frame, encoded: Encoded) -> Tracks:
-        """Return the backbone's tracks, our own if only the policy needs them, or none."""
+        """Return the tracks of the backbone, else own ones if the policy needs them, else none."""
         if encoded.tracks is not None:
             return encoded.tracks
         if not self.policy.needs_tracks:
@@ -162,7 +162,7 @@ class KeyframeOdometry:
     def _start_segment(self) -> Step:
         """Start a window at the newest frame: at the origin, or where tracking was lost.
 
-        Nothing observed how far the camera went while lost: the last covariance stays.
+        The motion while lost is unobserved: the last, large covariance stays.
         """
         newest = self._newest
         newest.covariance = self._step.covariance
@@ -171,14 +171,14 @@ class KeyframeOdometry:
         return replace(self._step, status=status, durations={}, decision=None, keep=True)
 
     def _hold(self, estimate: Estimate) -> Step:
-        """Leave a lost frame at the latest pose, with the estimate's large covariance."""
+        """Keep the latest pose for a lost frame, with the estimate's large covariance."""
         self._lost_in_a_row += 1
         window_covariance = self._propagate_covariance(estimate, -1, 1.0)
         self._update_state(estimate, 1.0, self._state.memory_scale)
         return Step(estimate.status, self._newest.covariance, window_covariance,
                     estimate.intrinsics, estimate.durations, keep=False)
 
-    def _place(self, estimate: Estimate) -> Step:
+    def _advance(self, estimate: Estimate) -> Step:
         """Align the scale of the window, chain its poses, and observe it once it is full."""
         self._lost_in_a_row = 0
         scale = self.scale.align(estimate, self._prior)
@@ -192,7 +192,7 @@ class KeyframeOdometry:
                     self._observe(estimate) if full else None)
 
     def _chain(self, T_anchor_frame: np.ndarray) -> None:
-        """Step 4: overwrite the poses of all frames in the window but the anchor's."""
+        """Step 4: overwrite the poses of all frames of the window except the anchor."""
         poses = self._keyframes[0].T_world_camera @ T_anchor_frame
         for keyframe, pose in zip(self.window[1:], poses[1:], strict=True):
             keyframe.T_world_camera = pose
@@ -200,7 +200,7 @@ class KeyframeOdometry:
     def _propagate_covariance(self, estimate: Estimate, index: int, scale: float) -> np.ndarray:
         """Set the covariance of a frame of the window; return its part relative to the anchor.
 
-        Both are (6, 6) in world axes and trajectory units. Poses are chained before.
+        Both are (6, 6) in world axes and trajectory units. Call it after `_chain`.
         """
         if not self._with_covariance:
             return self._step.window_covariance
@@ -211,13 +211,13 @@ class KeyframeOdometry:
         return relative
 
     def _update_state(self, estimate: Estimate, scale: float, memory_scale: float) -> None:
-        """Store what the next window starts from."""
+        """Store the state for the prior of the next window."""
         points = transform_points(estimate.points, self._keyframes[0].T_world_camera, scale)
         self._state = WindowState(self._newest.T_world_camera, points, estimate.memory,
                                   memory_scale)
 
     def _observe(self, estimate: Estimate) -> DecisionInput:
-        """Step 5: return what the policy sees."""
+        """Step 5: return the input of the policy."""
         frames, last = self.window, self._keyframes[-1]
         observation = observe([frame.encoded.descriptor for frame in frames],
                               np.array([frame.T_world_camera for frame in frames]),
@@ -237,14 +237,14 @@ class KeyframeOdometry:
         return FramePose(self._newest.encoded.stamp_ns, self._newest, np.eye(4), True)
 
     def _drop(self) -> FramePose:
-        """Drop the newest frame: its pose hangs on the last keyframe."""
+        """Drop the newest frame: its pose stays relative to the last keyframe."""
         newest, last = self._newest, self._keyframes[-1]
         self._release(newest)
         return FramePose(newest.encoded.stamp_ns, last,
                          geometry.relative(last.T_world_camera, newest.T_world_camera), False)
 
     def _retire(self, keyframe: Keyframe) -> None:
-        """Release a keyframe that leaves the window; the frames that hang on it are final."""
+        """Release a keyframe that leaves the window; frames relative to it become final."""
         self._release(keyframe)
         count = 0
         while count < len(self._pending) and self._pending[count].keyframe is keyframe:
@@ -253,13 +253,13 @@ class KeyframeOdometry:
         del self._pending[:count]
 
     def _clear_window(self) -> None:
-        """Empty the window; the next frame starts another one at the last known pose."""
+        """Empty the window; the next frame starts a new one at the last known pose."""
         self._lost_in_a_row = 0
         for keyframe in self._keyframes:
             self._retire(keyframe)
         self._keyframes.clear()
 
     def _release(self, frame: Keyframe) -> None:
-        """Free what the backbone holds for a frame."""
+        """Free the memory that the backbone holds for a frame."""
         if self._stream is not None:
             self._stream.release(frame.encoded)

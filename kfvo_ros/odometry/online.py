@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Odometry of a running camera in metres: pose, motion, covariances, path and trajectory file."""
+"""Online odometry in metres: pose, motion, covariances, path and trajectory file."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from kfvo_ros.trajectory import format_tum_line
 
 SPREAD_MEMORY = 0.05
 """Weight of the newest final pose in the mean square difference of arrival and final poses."""
-LEAST_VARIANCE = 1e-8
+MIN_VARIANCE = 1e-8
 """Lower limit of all variances: 0.1 mm and 0.1 mrad, squared."""
 StampedPose = tuple[int, np.ndarray]
 """(stamp_ns, T_world_x (4, 4))."""
@@ -64,7 +64,7 @@ class OnlineOdometry:
         self._odometry = odometry
         self._log = log
         self._scale = scale
-        self._path: deque[tuple[int, np.ndarray]] = deque(maxlen=path_length)
+        self._path: deque[StampedPose] = deque(maxlen=path_length)
         self._arrivals: deque[np.ndarray] = deque()
         self._spread = np.zeros((6, 6))
         self._last: FramePose | None = None
@@ -87,16 +87,14 @@ class OnlineOdometry:
                           self._metric_covariance(update.window_covariance),
                           update.intrinsics)
 
-    def path(self) -> list[tuple[int, np.ndarray]]:
+    def path(self) -> list[StampedPose]:
         """Return (stamp_ns, refined T_world_camera) of the latest frames."""
-        pending = [(pose.stamp_ns, self._metric(pose.T_world_camera))
-                   for pose in self._odometry.pending]
-        path = [*self._path, *pending]
+        path = [*self._path, *self._stamped(self._odometry.pending)]
         return path if self._path.maxlen is None else path[-self._path.maxlen:]
 
     def save(self, path: Path) -> int:
         """Write all poses so far to a new TUM file; return their number. Raises KfvoError."""
-        return self._log.save(path, self._lines(self._odometry.pending))
+        return self._log.save(path, self._stamped(self._odometry.pending))
 
     def finish(self) -> None:
         """Write the remaining poses and close the log."""
@@ -104,17 +102,17 @@ class OnlineOdometry:
         self._log.close()
 
     def _finalise(self, final: Iterable[FramePose]) -> None:
-        """Log final poses; update the spread of their differences to the poses at arrival."""
-        lines = self._lines(final)
-        for _, T_world_camera in lines:
+        """Log final poses; update the spread of their differences from the poses at arrival."""
+        poses = self._stamped(final)
+        for _, T_world_camera in poses:
             arrival = self._metric(self._arrivals.popleft())
             turn = geometry.log_so3(T_world_camera[:3, :3] @ arrival[:3, :3].T)
             change = np.concatenate([T_world_camera[:3, 3] - arrival[:3, 3], turn])
             self._spread += SPREAD_MEMORY * (np.outer(change, change) - self._spread)
-        self._path.extend(lines)
-        self._log.append(lines)
+        self._path.extend(poses)
+        self._log.append(poses)
 
-    def _lines(self, poses: Iterable[FramePose]) -> list[tuple[int, np.ndarray]]:
+    def _stamped(self, poses: Iterable[FramePose]) -> list[StampedPose]:
         return [(each.stamp_ns, self._metric(each.T_world_camera)) for each in poses]
 
     def _metric(self, pose: np.ndarray) -> np.ndarray:
@@ -124,7 +122,7 @@ class OnlineOdometry:
     def _metric_covariance(self, covariance: np.ndarray) -> np.ndarray:
         """Return the backbone's covariance in metres plus the spread between windows."""
         unit = np.repeat([self._scale, 1.0], 3)
-        total = covariance * np.outer(unit, unit) + self._spread + LEAST_VARIANCE * np.eye(6)
+        total = covariance * np.outer(unit, unit) + self._spread + MIN_VARIANCE * np.eye(6)
         return 0.5 * (total + total.T)
 
 
@@ -170,7 +168,7 @@ class TrajectoryLog:
             self._file.seek(0, 2)
 
     def close(self) -> None:
-        """Close the file; an empty one is not left behind."""
+        """Close the file; an empty one is deleted."""
         with self._writing_errors():
             self._file.close()  # flushes, which fails again where the disk is full
         if self.path is not None and self._count == 0:
@@ -178,7 +176,7 @@ class TrajectoryLog:
 
     @contextmanager
     def _writing_errors(self) -> Iterator[None]:
-        """Store a write error as the problem: a full disk must not end the odometry."""
+        """Store a write error in ``problem``: a full disk must not end the odometry."""
         try:
             yield
         except OSError as error:

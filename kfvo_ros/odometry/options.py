@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Options of odometry, of the VGGT backbone, and of how a sequence is read."""
+"""Options of the odometry, of the VGGT backbone and of reading a sequence."""
 
 from __future__ import annotations
 
@@ -15,25 +15,24 @@ from kfvo_ros.utils.config import option
 class OdometryOptions:
     """Options of the odometry."""
 
-    backbone: str = option('geometric', 'model that places the frames of a window: geometric '
-                           'on any processor, vggt on a GPU', ('geometric', 'vggt'))
+    backbone: str = option('geometric', 'model that estimates the poses of a window: geometric '
+                           'on any CPU, vggt on a GPU', ('geometric', 'vggt'))
     scale_rule: str | None = option(
-        None, "scale alignment between windows; default the backbone's own", SCALE_RULES,
+        None, "scale alignment between windows; default: the backbone's rule", SCALE_RULES,
         flag='scale')
     keyframes: str | None = option(
-        None, 'policy that decides which frames stay; default: a policy file, or the learned one '
-        'that comes with the backbone where it fits, else survival', POLICIES)
+        None, 'policy that selects the keyframes; default: learned where a policy file fits the '
+        'backbone and its options, else survival', POLICIES)
     flow_threshold: float = option(
-        50.0, 'optical_flow: keep when the tracks moved farther since the last keyframe [px]',
+        50.0, 'optical_flow: keep above this mean flow since the last keyframe [px]',
         least=0.0)
     survival_share: float = option(
-        0.8, "survival: keep when fewer of the last keyframe's tracks are left", least=0.0,
-        most=1.0)
+        0.8, "survival: keep when a smaller share of the last keyframe's tracks survives",
+        least=0.0, most=1.0)
     policy: str | None = option(
-        None, 'learned: file of the policy (.safetensors); default: the one that comes with the '
-        'backbone')
+        None, 'learned: policy file (.safetensors); default: the one shipped for the backbone')
     window_size: int = option(8, 'frames in a window', least=3, most=32)
-    seed: int = option(0, 'seed of every random choice', least=0)
+    seed: int = option(0, 'seed of all random choices', least=0)
 
 
 @dataclass(frozen=True)
@@ -47,30 +46,29 @@ class VggtOptions:
         None, "vggt: the repository's branch, tag or commit; default: main")
     device: str = option('auto', 'vggt: auto (a GPU if there is one), cpu, cuda or cuda:N')
     precision: str = option(
-        'auto', 'vggt: numbers of the matrices; auto: what the device does fast',
+        'auto', 'vggt: precision of the matrices; auto: the fastest of the device',
         ('auto', 'fp32', 'bf16', 'fp16'))
     image_width: int = option(
-        518, 'vggt: width of the images that the model sees [px], a multiple of 14; the model '
-        'was trained at 518', least=14, most=4200)
+        518, 'vggt: width of the input images [px], a multiple of 14; the model was trained at '
+        '518', least=14, most=4200)
     recompute: bool = option(
-        False, 'vggt: compute every window in full instead of reusing what is known of its '
-        'frames; the poses are the same')
+        False, 'vggt: compute every window in full instead of reusing the results of its frames; '
+        'the poses are the same')
     compile: bool = option(
-        False, 'vggt: have torch compile the model, a minute or so at the start; worth trying on '
-        'a GPU')
+        False, 'vggt: compile the model with torch, about a minute at the start; meant for GPUs')
 
 
 @dataclass(frozen=True)
 class SequenceOptions:
-    """How a sequence is read."""
+    """Options of reading a sequence."""
 
     kind: str | None = option(
         None, 'kind of sequence (euroc, tum, kitti, tartanair, bag, folder, video, synthetic); '
         'default: detected')
-    camera: str | None = option(None, 'calibration (camera_info.yaml) that wins over all others')
+    camera: str | None = option(None, 'calibration (camera_info.yaml) that takes precedence')
     image_topic: str | None = option(None, 'image topic of a bag; default: the first by name')
     ground_truth_topic: str | None = option(None, 'ground truth topic of a bag')
     ground_truth_to_camera: str | None = option(
-        None, 'where the camera is on the body of the ground truth: "x y z qx qy qz qw"')
-    rate: float = option(10.0, 'frames per second of what has no stamps [Hz]', least=1e-3)
+        None, 'pose of the camera in the ground truth body: "x y z qx qy qz qw"')
+    rate: float = option(10.0, 'frame rate of sequences without stamps [Hz]', least=1e-3)
     stop: int | None = option(None, 'stop after this many frames', least=1)

@@ -14,9 +14,9 @@ MIN_SHARED_POINTS = 8
 """Fewer shared points do not determine the scale."""
 STANDSTILL = 1e-3
 """Keyframes closer to the anchor than this share of the window's extent determine no scale."""
-LEAST_AGREEMENT = 0.98
-"""Cosine between known and new positions below which they determine no scale: of a camera at rest
-both are noise, and their ratio in every window would make the scale drift."""
+MIN_AGREEMENT = 0.98
+"""Below this cosine between known and new positions they determine no scale: at standstill both
+are noise, and the scale would drift with their ratio."""
 
 
 class ScaleAligner:
@@ -50,7 +50,7 @@ class ScaleAligner:
         return self._last
 
     def _from_median_depth(self, points: Points | None) -> float:
-        """Start a segment at the median depth of the last one; the very first at 1."""
+        """Return the scale that starts a segment at the last median depth, the first at 1."""
         if points is None or len(points.ids) == 0:
             return self._last
         return float(np.median(self._depths) / np.median(points.depths))
@@ -77,11 +77,11 @@ def compare_translations(known: np.ndarray, new: np.ndarray) -> float | None:
 
     `known` (S - 1, 4, 4) and `new` (S, 4, 4) are poses in the anchor; None at standstill.
     """
-    known_places, new_places = known[1:, :3, 3], new[1:len(known), :3, 3]
-    a, b = np.linalg.norm(known_places, axis=1), np.linalg.norm(new_places, axis=1)
+    known_positions, new_positions = known[1:, :3, 3], new[1:len(known), :3, 3]
+    a, b = np.linalg.norm(known_positions, axis=1), np.linalg.norm(new_positions, axis=1)
     extent = np.linalg.norm(new[:, :3, 3], axis=1).max()
-    agreement = (known_places * new_places).sum()
+    agreement = (known_positions * new_positions).sum()
     if (b @ b <= (STANDSTILL * extent) ** 2
-            or agreement <= LEAST_AGREEMENT * np.linalg.norm(a) * np.linalg.norm(b)):
+            or agreement <= MIN_AGREEMENT * np.linalg.norm(a) * np.linalg.norm(b)):
         return None
     return float(a @ b / (b @ b))

@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What odometry passes on for each frame: keyframes, poses, steps and updates."""
+"""Records of the odometry for each frame: keyframe, pose, step and update."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Keyframe:
 class FramePose:
     """The pose of one input frame, relative to a keyframe.
 
-    It follows the refinement of the keyframe and is final once that leaves the window.
+    It follows the keyframe's refinement and is final once the keyframe leaves the window.
     """
 
     stamp_ns: int
@@ -66,15 +66,15 @@ class Step:
 
 @dataclass(frozen=True)
 class Update:
-    """What one input frame changed.
+    """Result of one input frame.
 
     ``T_world_camera`` (4, 4) is the estimate at arrival, ``covariance`` (6, 6) its covariance
     in the world, translation first, and ``window_covariance`` the part that arose in this
     window. ``final`` are the frames whose poses became final, in input order; read their poses
     at once, since a keyframe that is still in the window may move. ``points`` of the window are
-    in the world, None without; ``durations`` [s] are those of encode, estimate and decide;
-    ``intrinsics`` K (3, 3) [px] is None unless the backbone estimates it; ``parts`` [s] are
-    durations within estimate, as the backbone measures them.
+    in the world, None for a backbone without points. ``durations`` [s] are those of encode,
+    estimate and decide, ``parts`` [s] those that the backbone measures within estimate.
+    ``intrinsics`` K (3, 3) [px] is None unless the backbone estimates it.
     """
 
     stamp_ns: int
@@ -91,7 +91,7 @@ class Update:
 
     @property
     def median_depth(self) -> float | None:
-        """Median distance of the points from the camera [trajectory units], None without."""
+        """Median distance of the points from the camera [units], None without points."""
         if self.points is None or not len(self.points.ids):
             return None
         return float(np.median(np.linalg.norm(

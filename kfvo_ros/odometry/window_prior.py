@@ -15,14 +15,14 @@ from kfvo_ros.backbones.base import Points, WindowPrior
 
 
 class HasPose(Protocol):
-    """Anything with a pose."""
+    """An object with a pose."""
 
     T_world_camera: np.ndarray
 
 
 @dataclass(frozen=True)
 class WindowState:
-    """The latest pose T_world_latest (4, 4), the points in the world, the backbone's memory.
+    """The latest pose T_world_latest (4, 4), points in the world, and the backbone's memory.
 
     ``memory_scale`` is trajectory units per unit of ``memory``.
     """
@@ -33,7 +33,7 @@ class WindowState:
     memory_scale: float = 1.0
 
     def prior_of(self, keyframes: Sequence[HasPose]) -> WindowPrior | None:
-        """Return the prior of a window that starts with `keyframes`; None before any estimate."""
+        """Return the prior of the window that `keyframes` start; None before any estimate."""
         if len(keyframes) == 1 and self.memory is None and self.points is None:
             return None
         T_anchor_world = geometry.invert(keyframes[0].T_world_camera)
@@ -60,10 +60,10 @@ def transform_points(points: Points | None, T_b_a: np.ndarray, scale: float) -> 
 
 
 def rotate_covariance(covariance: np.ndarray, T_b_a: np.ndarray, scale: float) -> np.ndarray:
-    """Return a covariance (6, 6), translation first, in the axes of b; translations are scaled."""
-    into = np.zeros((6, 6))
-    into[:3, :3], into[3:, 3:] = scale * T_b_a[:3, :3], T_b_a[:3, :3]
-    return into @ covariance @ into.T
+    """Return a covariance (6, 6), translation first, in axes of b, its translations scaled."""
+    jacobian = np.zeros((6, 6))
+    jacobian[:3, :3], jacobian[3:, 3:] = scale * T_b_a[:3, :3], T_b_a[:3, :3]
+    return jacobian @ covariance @ jacobian.T
 
 
 def propagate_covariance(relative: np.ndarray, reference: np.ndarray,
@@ -71,9 +71,9 @@ def propagate_covariance(relative: np.ndarray, reference: np.ndarray,
     """Return the covariance (6, 6) of a frame relative to an uncertain reference frame.
 
     `relative` is the covariance of the frame relative to the reference, `reference` that of the
-    reference, `offset` (3,) leads from the reference to the frame; all in world axes. A rotation
-    of the reference moves the frame: the lever arm.
+    reference, `offset` (3,) the vector from the reference to the frame; all in world axes. A
+    rotation of the reference moves the frame by this lever arm.
     """
-    lever = np.eye(6)
-    lever[:3, 3:] = -geometry.skew(offset)
-    return lever @ reference @ lever.T + relative
+    jacobian = np.eye(6)
+    jacobian[:3, 3:] = -geometry.skew(offset)
+    return jacobian @ reference @ jacobian.T + relative

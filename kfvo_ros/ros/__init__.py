@@ -1,3 +1,3 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What meets ROS 2: the only package that imports rclpy."""
+"""The ROS 2 node and bag player; the only package that imports rclpy."""

@@ -65,7 +65,8 @@ class PlayOptions:
     clock: float | None = option(None, 'publish the time of the bag on /clock at this rate [Hz]; '
                                  '40 without a value', least=1e-3, most=1e3, bare=40.0)
     wait_for_subscribers: int | None = option(
-        None, 'start when the image topic has this many subscribers (without images: every topic); '
+        None, 'start when the image topic has this many subscribers (without images: each '
+        'topic); '
         '1 without a value', least=1, bare=1)
 
 

@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Shared by all commands: the parser, lists of values, errors and exit status."""
+"""Frame of all commands: parser, exit status, errors in one line, and lists of values."""
 
 from __future__ import annotations
 
@@ -18,17 +18,18 @@ from kfvo_ros.errors import KfvoError, reason_of
 from kfvo_ros.utils.signals import raise_on_signals
 
 DISTRIBUTIONS = {'cv2': 'opencv-python-headless', 'yaml': 'PyYAML', 'PIL': 'pillow'}
-"""Distributions whose names are not those of their modules."""
+"""Distributions by module where the names differ."""
 ROS_MODULES = frozenset(('rclpy', 'rcl_interfaces', 'rosgraph_msgs', 'sensor_msgs', 'nav_msgs',
                          'geometry_msgs', 'diagnostic_msgs', 'std_msgs', 'std_srvs',
                          'builtin_interfaces'))
-"""Modules of a ROS 2 installation; the extra ``ros`` of setup.py brings them as wheels."""
+"""Modules of a ROS 2 installation; the extra ``ros`` installs them as wheels."""
 MAX_SEEDS = 10_000
+"""Sequences in a range."""
 RANGE = re.compile(r'(synthetic):([0-9]{1,10})-([0-9]{1,10})((?::[a-z]+)?)')
 
 
 def make_parser(command: str, description: str, examples: str = '') -> argparse.ArgumentParser:
-    """Return a parser with ``--version``; description and examples keep their lines."""
+    """Return a parser with ``--version``; description and examples keep their line breaks."""
     parser = argparse.ArgumentParser(prog=command, description=description, epilog=examples,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--version', action='version', version=f'kfvo_ros {__version__}')
@@ -39,9 +40,9 @@ def run_command(command: str, body: Callable[[list[str]], None], argv: list[str]
                 until_stopped: bool = False) -> int:
     """Call `body` with the arguments (None: those of the process); return the exit status.
 
-    Errors that a user can cause end it with one line on stderr and status 1; any other exception
-    is a bug and keeps its traceback. SIGINT and SIGTERM interrupt it; for a command that runs
-    `until_stopped` this is the normal end, with status 0.
+    Errors that a user can cause end the command with one line on stderr and status 1; any other
+    exception is a bug and keeps its traceback. SIGINT and SIGTERM interrupt the command: status
+    1, or 0 for one that runs `until_stopped`.
     """
     logging.basicConfig(format=f'{command}: %(levelname)s: %(message)s', level=logging.WARNING)
     raise_on_signals(even_ignored=until_stopped)
@@ -57,7 +58,7 @@ def run_command(command: str, body: Callable[[list[str]], None], argv: list[str]
         problem = str(missing_dependency(error))
     except KfvoError as error:
         problem = str(error)
-    except MemoryError as error:  # numpy says for which array
+    except MemoryError as error:  # numpy names the array
         problem = f'out of memory: {error}'.rstrip(': ')
     except OSError as error:
         problem = f'{error.filename or ""}: {reason_of(error)}'.lstrip(': ')
@@ -67,7 +68,7 @@ def run_command(command: str, body: Callable[[list[str]], None], argv: list[str]
 
 @contextmanager
 def _output_written() -> Iterator[None]:
-    """Flush stdout at the end, so that a closed pipe or full disk is an error with a message."""
+    """Flush stdout at the end, so that a closed pipe or a full disk is reported."""
     try:
         yield
     finally:
@@ -80,9 +81,9 @@ def _output_written() -> Iterator[None]:
 
 
 def missing_dependency(error: ImportError) -> KfvoError:
-    """Return the one line to show for a module that is missing or cannot be imported.
+    """Return the error for a required module that is missing or cannot be imported.
 
-    Raises the error itself if kfvo_ros does not require the module: then it is a bug.
+    Raises the ImportError itself if kfvo_ros does not require the module: then it is a bug.
     """
     module = (error.name or '').partition('.')[0]
     problem = 'is missing' if isinstance(error, ModuleNotFoundError) else \
@@ -98,7 +99,7 @@ def missing_dependency(error: ImportError) -> KfvoError:
 
 
 def _requirements() -> set[str]:
-    """Return the distributions that kfvo_ros requires, in lower case; none if not installed."""
+    """Return the distributions that kfvo_ros requires, in lower case; empty if not installed."""
     try:
         lines = importlib.metadata.requires('kfvo_ros') or []
     except importlib.metadata.PackageNotFoundError:
@@ -125,7 +126,7 @@ def parse_numbers(text: str, what: str, least: int = 0) -> tuple[int, ...]:
 
 
 def expand_ranges(texts: Iterable[str]) -> tuple[str, ...]:
-    """Return the sequences, each ``synthetic:A-B[:STYLE]`` replaced by one for every seed.
+    """Return the sequences with each ``synthetic:A-B[:STYLE]`` expanded to one per seed.
 
     Raises KfvoError for a range that is empty or too long.
     """

@@ -32,9 +32,9 @@ def option(default: Any = MISSING, description: str = '', choices: tuple[str, ..
            flag: str = '', key: str = '', within: Mapping[str, Range] = NO_RANGES) -> Any:
     """Declare one field of an options dataclass.
 
-    `bare` is the value of a command line option that is given without one; `flag` and `key` are
-    the names on command lines and in YAML files where they differ from the field's; `within` are
-    ranges for the fields of a nested dataclass that declares none itself.
+    `bare` is the value of a command line option that is given without a value; `flag` and `key`
+    are the names on command lines and in YAML files where they differ from the field's; `within`
+    are ranges for the fields of a nested dataclass that declares none itself.
     """
     return field(default=default, metadata={
         'description': description, 'choices': choices, 'least': least, 'most': most,
@@ -47,7 +47,7 @@ required = functools.partial(option, MISSING, '')
 
 @dataclass(frozen=True)
 class Option:
-    """One field of an options dataclass: its declaration, and the type that its values have.
+    """One field of an options dataclass: its declaration and the type of its values.
 
     ``kind`` is the type without None and, of a tuple, that of its elements.
     """
@@ -68,7 +68,7 @@ class Option:
 
     @property
     def expected(self) -> str:
-        """What a value may be, in words."""
+        """Description of the allowed values."""
         if self.is_list:
             return 'a list of words'
         if self.choices:
@@ -78,21 +78,21 @@ class Option:
         return f'{KINDS[self.kind]}{" of " if ends else ""}{" and ".join(ends)}'
 
     def check(self, value: Any) -> Any:
-        """Return a value in the type of the field; ValueError with what was expected and came."""
+        """Return a value in the type of the field; raises ValueError unless it is allowed."""
         if value is None and self.may_be_none:
             return None
         if self.is_list:
             if not isinstance(value, (list, tuple)) or not all(
                     isinstance(each, self.kind) for each in value):
-                raise self.refusal(value)
+                raise self._error(value)
             return tuple(value)
         checked = float(value) if self.kind is float and type(value) is int else value
         if type(checked) is not self.kind or not self._allows(checked):
-            raise self.refusal(value)
+            raise self._error(value)
         return checked
 
     def parse(self, text: str) -> Any:
-        """Return the value of a text (an element, of a list); raises as `check` does."""
+        """Return the value of a text, of a list an element; raises as `check` does."""
         value: Any = text
         if self.kind is bool:
             value = {**dict.fromkeys(TRUE, True), **dict.fromkeys(FALSE, False)}.get(text.lower())
@@ -100,13 +100,13 @@ class Option:
             try:
                 value = self.kind(text)
             except (ValueError, OverflowError):
-                raise self.refusal(text) from None
+                raise self._error(text) from None
         if value is None or not self._allows(value):
-            raise self.refusal(text)
+            raise self._error(text)
         return value
 
-    def refusal(self, value: Any) -> ValueError:
-        """Return the error that names what was expected and what came."""
+    def _error(self, value: Any) -> ValueError:
+        """Return the error that names the allowed values and the value."""
         return ValueError(f'expected {self.expected}, came {value!r}')
 
     def _allows(self, value: Any) -> bool:
@@ -123,9 +123,9 @@ def options_of(kind: type[Any]) -> tuple[Option, ...]:
     found = []
     for declared in fields(kind):
         parts = typing.get_args(hints[declared.name]) or (hints[declared.name],)
-        of_interest = [part for part in parts if part not in (types.NoneType, Ellipsis)]
+        kinds = [part for part in parts if part not in (types.NoneType, Ellipsis)]
         is_list = typing.get_origin(hints[declared.name]) is tuple
-        found.append(Option(declared.name, of_interest[0], declared.default,
+        found.append(Option(declared.name, kinds[0], declared.default,
                             types.NoneType in parts, is_list, **declared.metadata))
     return tuple(found)
 
@@ -135,7 +135,7 @@ def options_of(kind: type[Any]) -> tuple[Option, ...]:
 
 def add_arguments(parser: argparse.ArgumentParser, options: type[Any],
                   without: tuple[str, ...] = ()) -> None:
-    """Add one ``--name`` for each field of an options dataclass, `without` some of them."""
+    """Add one ``--name`` for each field of an options dataclass except those of `without`."""
     group = parser.add_argument_group((options.__doc__ or '').splitlines()[0].rstrip('.'))
     for declared in options_of(options):
         if declared.name in without:
@@ -157,7 +157,7 @@ def add_arguments(parser: argparse.ArgumentParser, options: type[Any],
 
 
 def from_arguments(options: type[Options], arguments: argparse.Namespace) -> Options:
-    """Build the dataclass from parsed arguments; what is missing there has its default."""
+    """Return the dataclass of parsed arguments; fields that are missing have their defaults."""
     values = {declared.name: getattr(arguments, declared.name, None)
               for declared in options_of(options)}
     return options(**{name: tuple(value) if isinstance(value, list) else value
@@ -165,7 +165,7 @@ def from_arguments(options: type[Options], arguments: argparse.Namespace) -> Opt
 
 
 def to_arguments(options: Any) -> list[str]:
-    """Return the command line that gives these options; defaults are left out."""
+    """Return the command line that yields these options; defaults are omitted."""
     arguments = []
     for declared in options_of(type(options)):
         value = getattr(options, declared.name)
@@ -174,7 +174,7 @@ def to_arguments(options: Any) -> list[str]:
         if value is True:
             arguments.append(_flag(declared))
         else:
-            # With '=', for a value may begin with a dash.
+            # With '=', since a value may begin with a dash.
             arguments += [f'{_flag(declared)}={each}'
                           for each in (value if isinstance(value, tuple) else (value,))]
     return arguments
@@ -185,7 +185,7 @@ def _flag(declared: Option) -> str:
 
 
 def _parse_argument(declared: Option, text: str) -> Any:
-    """Return the value of a text; raises what argparse reports."""
+    """Return the value of a text; raises the error that argparse reports."""
     try:
         return declared.parse(text)
     except ValueError as error:
@@ -197,25 +197,25 @@ def _parse_argument(declared: Option, text: str) -> Any:
 # YAML files
 
 
-def from_mapping(options: type[Options], mapping: Any, file: str, place: str = '',
+def from_mapping(options: type[Options], mapping: Any, file: str, parent: str = '',
                  within: Mapping[str, Range] = NO_RANGES) -> Options:
-    """Build the dataclass from a mapping that has every key and no other.
+    """Return the dataclass of a mapping that has every key and no other.
 
-    Fields may be dataclasses themselves; null stands for None. Raises KfvoError with `file`, the
-    `place` of the key in it, what was expected and what came.
+    Fields may be dataclasses themselves; null is None. `parent` is the key path of the mapping
+    in `file`. Raises KfvoError with file and key path, what was expected and what came.
     """
     declared = {each.key or each.name: each for each in options_of(options)}
     if not isinstance(mapping, dict):
-        raise _unexpected(file, place, declared, mapping)
+        raise _unexpected(file, parent, declared, mapping)
     for name in mapping:
         if name not in declared:
-            raise _unexpected(file, place, declared, name)
+            raise _unexpected(file, parent, declared, name)
     values = {}
     for name, each in declared.items():
-        inner = f'{place}.{name}'.lstrip('.')
+        key = f'{parent}.{name}'.lstrip('.')
         if name not in mapping:
-            raise KfvoError(f'{file}: expected the key {inner}, it is missing')
-        values[each.name] = _value_of(each, mapping[name], file, inner, within.get(each.name))
+            raise KfvoError(f'{file}: expected the key {key}, it is missing')
+        values[each.name] = _value_of(each, mapping[name], file, key, within.get(each.name))
     return options(**values)
 
 
@@ -228,12 +228,12 @@ def to_mapping(options: Any) -> dict[str, Any]:
     return mapping
 
 
-def _value_of(declared: Option, value: Any, file: str, place: str, range_: Range | None) -> Any:
+def _value_of(declared: Option, value: Any, file: str, key: str, range_: Range | None) -> Any:
     """Return a value of a YAML file in the type of its field."""
     if is_dataclass(declared.kind):
         if value is None and declared.may_be_none:
             return None
-        return from_mapping(declared.kind, value, file, place, declared.within)
+        return from_mapping(declared.kind, value, file, key, declared.within)
     if range_ is not None:
         declared = Option(declared.name, declared.kind, declared.default, declared.may_be_none,
                           declared.is_list, least=range_[0], most=range_[1])
@@ -242,17 +242,17 @@ def _value_of(declared: Option, value: Any, file: str, place: str, range_: Range
     try:
         return declared.check(value)
     except (ValueError, OverflowError):
-        raise KfvoError(f'{file}: {place}: expected {declared.expected}; came {value!r}') from None
+        raise KfvoError(f'{file}: {key}: expected {declared.expected}; came {value!r}') from None
 
 
 def _number(text: str) -> Any:
-    """Return the number of a text, or the text: YAML 1.1 reads 3e-4 as a word."""
+    """Return the number of a text, or the text: YAML 1.1 reads 3e-4 as text."""
     try:
         return float(text)
     except ValueError:
         return text
 
 
-def _unexpected(file: str, place: str, declared: Mapping[str, Option], came: Any) -> KfvoError:
-    return KfvoError(f'{file}: {f"{place}: " if place else ""}expected the keys '
+def _unexpected(file: str, parent: str, declared: Mapping[str, Option], came: Any) -> KfvoError:
+    return KfvoError(f'{file}: {f"{parent}: " if parent else ""}expected the keys '
                      f'{", ".join(declared)}; came {came!r}')

@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Files: atomic writes, YAML, text tables, and the files of the config folder."""
+"""Files: atomic writes, YAML, text tables and the config folder."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from kfvo_ros.errors import KfvoError, reason_of
 
 MALFORMED_YAML = (yaml.YAMLError, ValueError, LookupError, AttributeError, ArithmeticError,
                   RecursionError)
-"""What PyYAML raises, including its constructors of dates and numbers."""
-Row = TypeVar('Row')
+"""Exceptions of PyYAML, including those of its constructors of dates and numbers."""
+Parsed = TypeVar('Parsed')
 CONFIG_FOLDER = Path('share', 'kfvo_ros', 'config')
 
 
 @contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
-    """Yield a draft path beside `path`; at the end the draft replaces it in one step.
+    """Yield a draft path beside `path`; at the end the draft replaces `path` in one step.
 
-    Readers see the old file until then, and keep it when an error is raised.
+    Readers see the old file until then; after an error it stays.
     """
     draft = path.with_name(f'.{path.name}.{os.getpid()}')
     try:
@@ -49,11 +49,11 @@ def read_yaml(path: Path, what: str = '') -> Any:
         raise KfvoError(f'cannot read {what}{path}: {reason_of(error)}') from error
 
 
-def read_rows(path: Path, form: str, parse: Callable[[str], Row]) -> list[Row]:
-    """Parse every line that is neither empty nor a ``#`` comment.
+def read_rows(path: Path, form: str, parse: Callable[[str], Parsed]) -> list[Parsed]:
+    """Return every line parsed, except empty lines and ``#`` comments.
 
-    `parse` raises ValueError or IndexError for a line that does not have the `form`, which is
-    shown to the user. Raises KfvoError with file and line for that, and for an unreadable file.
+    `parse` raises ValueError or IndexError for a line that is not of the `form`, a description
+    for the message. Raises KfvoError with file and line then, and for an unreadable file.
     """
     try:
         lines = path.read_text(encoding='utf-8').splitlines()
@@ -80,7 +80,7 @@ def parse_floats(fields: Iterable[str], count: int) -> list[float]:
 
 
 def parse_pose(fields: Iterable[str]) -> list[float]:
-    """Return a position and a quaternion in the order of `fields`; ValueError for no rotation."""
+    """Return position and quaternion in the order of `fields`; ValueError for a zero norm."""
     numbers = parse_floats(fields, 7)
     if math.hypot(*numbers[3:]) < 1e-3:
         raise ValueError('a quaternion of zeros')
@@ -88,9 +88,10 @@ def parse_pose(fields: Iterable[str]) -> list[float]:
 
 
 def find_config(name: str) -> Path:
-    """Return the file at this path, else the one of the config folder, else the path itself.
+    """Return the path if it exists, else the file of this name in the config folder if it exists.
 
     The config folder is that of the checkout or of the installation (share/kfvo_ros/config).
+    Returns the path itself where neither exists.
     """
     given = Path(name).expanduser()
     if given.exists() or given.name != name:

@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""This process and its host: threads, memory, durations of steps, the processor's name."""
+"""Process and host: threads, memory, durations of steps, name of the processor."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from pathlib import Path
 import cv2
 from threadpoolctl import threadpool_limits
 
-CPU_LIST = Path('/proc/cpuinfo')
+CPUINFO = Path('/proc/cpuinfo')
 
 
 @contextmanager
 def single_threaded() -> Iterator[None]:
-    """Run BLAS and OpenCV in one thread: threads do not pay for the small matrices of a window."""
+    """Run BLAS and OpenCV in one thread: more are slower on the small matrices of a window."""
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
@@ -35,7 +35,7 @@ def single_threaded() -> Iterator[None]:
 
 def peak_rss_mb() -> float:
     """Return the peak resident memory of this process so far [MiB]."""
-    # getrusage would count what the parent held before it started this program.
+    # ru_maxrss of getrusage includes the memory of the parent before exec.
     return _memory_mb('VmHWM')
 
 
@@ -46,19 +46,19 @@ def rss_mb() -> float:
 
 def available_mb() -> float:
     """Return the memory available without swapping [MiB], infinity where it is unknown."""
-    return _listed_mb('/proc/meminfo', 'MemAvailable') or math.inf
+    return _read_mb('/proc/meminfo', 'MemAvailable') or math.inf
 
 
 def _memory_mb(key: str) -> float:
-    listed = _listed_mb('/proc/self/status', key)
+    listed = _read_mb('/proc/self/status', key)
     if listed is not None:
         return listed
     unit = 1024.0 ** 2 if sys.platform == 'darwin' else 1024.0
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
 
 
-def _listed_mb(file: str, key: str) -> float | None:
-    """Return an entry [MiB] of a list below /proc, None where there is none."""
+def _read_mb(file: str, key: str) -> float | None:
+    """Return an entry [MiB] of a file below /proc, None where there is none."""
     path = Path(file)
     found = path.exists() and re.search(rf'^{key}:\s*(\d+) kB', path.read_text('ascii'), re.M)
     return int(found[1]) / 1024.0 if found else None
@@ -82,12 +82,12 @@ class Stopwatch:
 
 
 def host_info() -> str:
-    """Return processor, number of cores and Python's version."""
+    """Return processor, number of cores and version of Python."""
     return f'{_processor()}, {os.cpu_count()} cores, Python {platform.python_version()}'
 
 
 def _processor() -> str:
-    """Return the model name of the processor, or its architecture where that is unknown."""
-    listed = CPU_LIST.read_text('utf-8', 'replace') if CPU_LIST.exists() else ''
+    """Return the model name of the processor, its architecture where unknown."""
+    listed = CPUINFO.read_text('utf-8', 'replace') if CPUINFO.exists() else ''
     model = re.search(r'^model name\s*: *(.+)$', listed, re.MULTILINE)
     return model[1].strip() if model else platform.processor() or platform.machine()

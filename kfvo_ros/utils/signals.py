@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""SIGINT and SIGTERM: raised as one exception, ignored, blocked, or collected."""
+"""SIGINT and SIGTERM: raise one exception for both, or ignore, block or collect them."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 class Interrupted(KeyboardInterrupt):
     """SIGINT or SIGTERM arrived.
 
-    A plain KeyboardInterrupt that passed through an `exec` (dataclasses use it) makes Python
-    exit by SIGINT, even when it was caught.
+    A plain KeyboardInterrupt that passes through an `exec` (as in dataclasses) makes Python exit
+    by SIGINT, even when it is caught.
     """
 
 
 def raise_on_signals(even_ignored: bool) -> None:
     """Raise Interrupted in the main thread on either signal.
 
-    A signal that this process ignores since its start, as background jobs of shell scripts do,
-    is only handled if `even_ignored`.
+    A signal that the process ignores from its start, as background jobs of shell scripts do
+    SIGINT, is handled only if `even_ignored`.
     """
     for number in SIGNALS:
         if even_ignored or signal.getsignal(number) != signal.SIG_IGN:
@@ -32,7 +32,7 @@ def raise_on_signals(even_ignored: bool) -> None:
 
 
 def ignore_signals() -> None:
-    """Ignore both signals: another Ctrl-C would end a clean-up in a traceback."""
+    """Ignore both signals: another Ctrl-C would interrupt the clean-up."""
     for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)
 
@@ -52,7 +52,7 @@ def signals_blocked() -> Iterator[None]:
 
 @contextmanager
 def signals_collected() -> Iterator[list[int]]:
-    """Yield a list to which each signal is appended; nothing is raised in the block."""
+    """Yield a list to which each signal is appended instead of raising an exception."""
     received: list[int] = []
     previous = {number: signal.signal(number, lambda number, _: received.append(number))
                 for number in SIGNALS if signal.getsignal(number) != signal.SIG_IGN}

@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""How far the odometry is from the truth, with bounds that it must keep."""
+"""Accuracy of the odometry: upper bounds of its errors."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from kfvo_ros.trajectory import Trajectory
 POLICIES = {'every': EveryFrame, 'survival': Survival, 'optical_flow': OpticalFlow}
 
 
-class Recorded(GeometricBackbone):
-    """The geometric backbone with a sequence's frames encoded once for all policies."""
+class RecordedBackbone(GeometricBackbone):
+    """The geometric backbone with the frames of a sequence encoded once for all policies."""
 
     def __init__(self, encoded: list[Encoded]) -> None:
         super().__init__()
-        self._encoded = {one.stamp_ns: one for one in encoded}
+        self._encoded = {each.stamp_ns: each for each in encoded}
 
     def open(self, camera: Camera | None) -> GeometricStream:
         stream = super().open(camera)
@@ -38,28 +38,28 @@ class Recorded(GeometricBackbone):
 
 
 @lru_cache(maxsize=1)
-def recorded(text: str, count: int) -> tuple[Sequence, Recorded]:
+def recorded_backbone(text: str, count: int) -> tuple[Sequence, RecordedBackbone]:
     sequence = open_sequence(text)
     stream = GeometricBackbone().open(sequence.camera)
-    return sequence, Recorded([stream.encode(frame) for frame in islice(sequence, count)])
+    return sequence, RecordedBackbone([stream.encode(frame) for frame in islice(sequence, count)])
 
 
-def stamped(backbone: Recorded, camera: Camera | None) -> Iterator[Frame]:
+def stamped(backbone: RecordedBackbone, camera: Camera | None) -> Iterator[Frame]:
     return (Frame(stamp_ns, np.zeros((1, 1), np.uint8), camera)
             for stamp_ns in backbone._encoded)
 
 
 def error_percent(text: str, count: int, policy: str) -> float:
-    """Return the ATE in percent of the path, and assert that it beats the trivial answers."""
-    sequence, backbone = recorded(text, count)
+    """Return the ATE in percent of the path, and assert that it beats the trivial baselines."""
+    sequence, backbone = recorded_backbone(text, count)
     truth = sequence.ground_truth().trajectory
     result = run(stamped(backbone, sequence.camera), POLICIES[policy](), backbone)
     assert 'lost' not in result.statuses
     estimate = result.trajectory
     error = metrics.absolute_trajectory_error(estimate, truth)
-    for trivial in (metrics.constant_position, metrics.straight_line):
+    for baseline in (metrics.constant_position, metrics.straight_line):
         assert error.rmse < metrics.absolute_trajectory_error(
-            trivial(estimate.stamps_ns), truth).rmse
+            baseline(estimate.stamps_ns), truth).rmse
     return 100.0 * error.rmse / error.path_length
 
 
@@ -75,8 +75,8 @@ def test_tartanair(policy, data_path):
 
 
 @pytest.mark.parametrize('policy', ['every', 'survival', 'optical_flow'])
-def test_standing_still(policy, data_path):
-    sequence, backbone = recorded(str(data_path('euroc/V1_01_easy_static')), 200)
+def test_standstill(policy, data_path):
+    sequence, backbone = recorded_backbone(str(data_path('euroc/V1_01_easy_static')), 200)
     result = run(stamped(backbone, sequence.camera), POLICIES[policy](), backbone)
     depth = np.median([update.median_depth for update in result.updates[1:]])
     trajectory: Trajectory = result.trajectory

@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Covariances and state from window to window: numbers against sampled motions."""
+"""Covariances and state from window to window, against sampled motions."""
 
 from __future__ import annotations
 
@@ -37,25 +37,26 @@ RELATIVE = np.diag([1.0, 4.0, 9.0, 0.01, 0.04, 0.09]) * 1e-4
 UNIT = 3.0
 
 
-def sampled(covariance: np.ndarray, count: int = 200_000) -> np.ndarray:
+def sample_errors(covariance: np.ndarray, count: int = 200_000) -> np.ndarray:
     """Return samples (N, 6) of a normal distribution."""
     return RNG.multivariate_normal(np.zeros(6), covariance, count)
 
 
-def test_rotated_covariance_is_that_of_rotated_and_scaled_errors():
-    errors = sampled(RELATIVE)
+def test_rotate_covariance_against_samples():
+    errors = sample_errors(RELATIVE)
     rotation = T_WORLD_ANCHOR[:3, :3]
-    moved = np.concatenate([UNIT * errors[:, :3] @ rotation.T, errors[:, 3:] @ rotation.T], axis=1)
-    expected = np.cov(moved.T)
+    transformed = np.concatenate([UNIT * errors[:, :3] @ rotation.T, errors[:, 3:] @ rotation.T],
+                                 axis=1)
+    expected = np.cov(transformed.T)
     found = rotate_covariance(RELATIVE, T_WORLD_ANCHOR, UNIT)
     np.testing.assert_allclose(found, expected, atol=0.02 * expected.max())
-    # Not scaled: rotations. Not rotated back: the largest axis is that of the third column.
+    # Rotations are not scaled. The largest axis is the third column, not the third row.
     assert np.trace(found[3:, 3:]) == pytest.approx(np.trace(RELATIVE[3:, 3:]))
     axis = np.linalg.eigh(found[:3, :3])[1][:, -1]
     assert abs(axis @ rotation[:, 2]) == pytest.approx(1.0)
 
 
-def test_an_uncertain_reference_moves_the_frame_by_its_lever_arm():
+def test_rotation_of_the_reference_moves_the_frame_by_the_lever_arm():
     offset = np.array([2.0, 0.0, 0.0])
     reference = np.zeros((6, 6))
     reference[5, 5] = 0.01  # rotation about z moves a point on x along y
@@ -65,10 +66,10 @@ def test_an_uncertain_reference_moves_the_frame_by_its_lever_arm():
     assert found[0, 0] == found[2, 2] == 0.0
 
 
-def test_propagated_covariance_is_that_of_composed_motions():
+def test_propagate_covariance_against_samples():
     reference = RELATIVE @ RELATIVE.T / RELATIVE.max() + RELATIVE
     offset = np.array([0.7, -1.9, 1.1])
-    of_reference, of_frame = sampled(reference), sampled(RELATIVE)
+    of_reference, of_frame = sample_errors(reference), sample_errors(RELATIVE)
     rotation = geometry.exp_so3(of_reference[:, 3:])
     positions = of_reference[:, :3] + (rotation @ offset - offset) + of_frame[:, :3]
     rotations = of_reference[:, 3:] + of_frame[:, 3:]
@@ -77,7 +78,7 @@ def test_propagated_covariance_is_that_of_composed_motions():
     np.testing.assert_allclose(found, expected, atol=0.02 * expected.max())
 
 
-def test_poses_and_points_change_unit_and_frame():
+def test_scale_poses_and_transform_points():
     poses = np.stack([np.eye(4), T_WORLD_ANCHOR])
     scaled = scale_poses(poses, UNIT)
     np.testing.assert_allclose(scaled[1, :3, 3], [6.0, -3.0, 1.5])
@@ -91,7 +92,7 @@ def test_poses_and_points_change_unit_and_frame():
 
 
 class KnownBackbone(Backbone):
-    """Sees true poses in a unit of its own; is lost at the stamps in `lost_ns`."""
+    """Estimates true poses in its own unit; is lost at the stamps in `lost_ns`."""
 
     name = 'known'
     descriptor_size = 1
@@ -113,13 +114,13 @@ class KnownBackbone(Backbone):
 
     def _estimate(self, window):
         if window.frames[-1].stamp_ns in self.lost_ns:
-            return lost_estimate(window, memory='kept')
+            return lost_estimate(window, memory='memory')
         world = np.stack([pose_at(frame.stamp_ns) for frame in window.frames])
         poses = scale_poses(geometry.relative(world[0], world), 1.0 / UNIT)
         poses[0] = np.eye(4)
         covariance = np.arange(len(poses))[:, None, None] * RELATIVE
         return Estimate(poses, lambda: covariance, None, np.zeros(0, dtype=np.float32),
-                        memory='kept')
+                        memory='memory')
 
 
 def pose_at(stamp_ns: int) -> np.ndarray:
@@ -141,7 +142,7 @@ def process(backbone: Backbone, count: int, **options) -> list[Update]:
     return [odometry.process(frame) for frame in frames(count)]
 
 
-def test_covariance_is_carried_from_anchor_to_anchor():
+def test_covariance_is_propagated_from_anchor_to_anchor():
     updates = process(KnownBackbone(), 5)
     assert not updates[0].covariance.any()
     anchor, of_anchor = np.eye(4), np.zeros((6, 6))
@@ -168,7 +169,7 @@ def test_without_covariance_all_are_zero():
         assert not update.covariance.any() and not update.window_covariance.any()
 
 
-def test_a_lost_frame_is_uncertain_where_it_stands_and_changes_no_scale():
+def test_a_lost_frame_keeps_pose_and_scale_with_large_covariance():
     last = 5 * RATE_NS
     backbone = KnownBackbone(last)
     *_, before, update, after = process(backbone, 6)
@@ -178,13 +179,13 @@ def test_a_lost_frame_is_uncertain_where_it_stands_and_changes_no_scale():
     assert np.diag(after.covariance).max() < 1.0
     # The unit of the backbone's memory stays.
     assert backbone.priors[-1].memory_scale == backbone.priors[-2].memory_scale != 1.0
-    assert backbone.priors[-1].memory == 'kept'
+    assert backbone.priors[-1].memory == 'memory'
 
 
 @pytest.mark.parametrize('count', [MAX_LOST_FRAMES - 1, MAX_LOST_FRAMES])
-def test_the_window_restarts_after_as_many_lost_frames(count):
-    gone = [(5 + index) * RATE_NS for index in range(count)]
-    backbone = KnownBackbone(*gone)
+def test_the_window_restarts_after_max_lost_frames(count):
+    lost_stamps_ns = [(5 + index) * RATE_NS for index in range(count)]
+    backbone = KnownBackbone(*lost_stamps_ns)
     updates = process(backbone, 4 + count + 3)
     last_lost, first = updates[3 + count], updates[4 + count]
     restarted = count == MAX_LOST_FRAMES
@@ -192,7 +193,7 @@ def test_the_window_restarts_after_as_many_lost_frames(count):
     if not restarted:
         assert np.diag(first.covariance).max() < 1.0
         return
-    # It starts where the camera was lost, as uncertain as it was, and stays so.
+    # It starts at the pose and covariance of the last lost frame; the covariance stays large.
     np.testing.assert_allclose(first.T_world_camera, last_lost.T_world_camera, atol=1e-9)
     np.testing.assert_array_equal(first.covariance, last_lost.covariance)
     assert first.is_keyframe

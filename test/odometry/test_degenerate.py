@@ -1,13 +1,15 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Input that no odometry can follow: it says so, resumes, and its trajectory stays one piece."""
+"""Degenerate input: the odometry reports it, resumes, and its trajectory stays continuous."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
 import pytest
-from odometry_scenes import RATE_NS, Run, frames_of, restamped, run, with_image
+from odometry_scenes import RATE_NS, OdometryRun, frames_of, restamped, run, with_image
 
 from kfvo_ros import geometry
 from kfvo_ros.backbones.geometric.backbone import GeometricBackbone
@@ -29,10 +31,10 @@ def frames() -> tuple[Frame, ...]:
     return frames_of(0, COUNT)
 
 
-def checked(frames: list[Frame] | tuple[Frame, ...], policy=Survival, **options) -> Run:
-    """Run and assert what holds for any input whatever."""
+def run_and_check(frames: Sequence[Frame], policy=Survival, **options) -> OdometryRun:
+    """Run and assert what holds for every input."""
     result = run(frames, policy(), **options)
-    assert [placed.stamp_ns for placed in result.final] == [frame.stamp_ns for frame in frames]
+    assert [pose.stamp_ns for pose in result.final] == [frame.stamp_ns for frame in frames]
     for update in result.updates:
         assert np.isfinite(update.T_world_camera).all()
         assert np.isfinite(update.covariance).all()
@@ -41,18 +43,18 @@ def checked(frames: list[Frame] | tuple[Frame, ...], policy=Survival, **options)
     R = result.poses[:, :3, :3]
     np.testing.assert_allclose(R @ np.swapaxes(R, 1, 2), np.tile(np.eye(3), (len(R), 1, 1)),
                                atol=1e-9)
-    for pose, placed in zip(result.emitted_poses, result.final):
-        assert np.array_equal(pose, placed.T_world_camera)
+    for pose, frame_pose in zip(result.emitted_poses, result.final):
+        assert np.array_equal(pose, frame_pose.T_world_camera)
     return result
 
 
-def steps(result: Run) -> np.ndarray:
-    """Return how far each frame went, in usual steps of this run."""
+def steps(result: OdometryRun) -> np.ndarray:
+    """Return the translation of each frame over the median one of the run."""
     length = np.linalg.norm(np.diff(result.poses[:, :3, 3], axis=0), axis=1)
     return length / np.median(length[length > 0.0])
 
 
-def relative_error(result: Run, indices: list[int], seed: int = 0) -> float:
+def relative_error(result: OdometryRun, indices: list[int], seed: int = 0) -> float:
     """Return the ATE over some frames as a share of their path."""
     truth = SyntheticSequence(seed, 'smooth', COUNT).ground_truth().trajectory.select(indices)
     estimate = Trajectory(truth.stamps_ns, result.poses[indices])
@@ -60,22 +62,22 @@ def relative_error(result: Run, indices: list[int], seed: int = 0) -> float:
     return error.rmse / error.path_length
 
 
-def blinded(frames, first: int, count: int, value: int) -> list[Frame]:
-    """Return the frames with some of them of one grey value."""
+def with_blank_images(frames, first: int, count: int, value: int) -> list[Frame]:
+    """Return the frames with `count` images from `first` of one grey `value`."""
     return [with_image(frame, np.full_like(frame.image, value))
             if first <= index < first + count else frame for index, frame in enumerate(frames)]
 
 
 @pytest.mark.parametrize(('policy', 'value'), [(EveryFrame, 0), (Survival, 255), (Survival, 128)])
-def test_no_texture_at_all(frames, policy, value):
-    result = checked(blinded(frames[:16], 0, 16, value), policy)
+def test_images_without_texture_are_lost_at_the_origin(frames, policy, value):
+    result = run_and_check(with_blank_images(frames[:16], 0, 16, value), policy)
     assert 'ok' not in result.statuses[1:]
     assert np.array_equal(result.poses, np.tile(np.eye(4), (16, 1, 1)))
 
 
 @pytest.mark.parametrize(('policy', 'count'), [(Survival, 1), (EveryFrame, 3), (Survival, 9)])
-def test_black_from_the_start(frames, policy, count):
-    result = checked(blinded(frames, 0, count, 0), policy)
+def test_black_images_at_the_start(frames, policy, count):
+    result = run_and_check(with_blank_images(frames, 0, count, 0), policy)
     assert set(result.statuses[1:count]) <= {'lost'}
     assert set(result.statuses[count + 10:]) == {'ok'}
     assert relative_error(result, list(range(count + 2, COUNT))) < 0.03
@@ -84,35 +86,35 @@ def test_black_from_the_start(frames, policy, count):
 @pytest.mark.parametrize(('policy', 'first', 'count', 'value'), [
     (Survival, 20, 1, 0), (EveryFrame, 20, 3, 0), (EveryFrame, 20, 1, 255), (Survival, 20, 2, 255),
     (Survival, 4, 2, 0)])
-def test_a_blink_is_bridged(frames, policy, first, count, value):
-    result = checked(blinded(frames, first, count, value), policy)
+def test_a_few_blank_images_are_bridged(frames, policy, first, count, value):
+    result = run_and_check(with_blank_images(frames, first, count, value), policy)
     assert result.statuses[first:first + count] == ['lost'] * count
     assert set(result.statuses[first + count:]) == {'ok'}
-    seeing = [index for index in range(COUNT) if not first <= index < first + count]
-    assert relative_error(result, seeing) < 0.02
+    visible = [index for index in range(COUNT) if not first <= index < first + count]
+    assert relative_error(result, visible) < 0.02
     assert steps(result).max() < 5.0 * (count + 1)
 
 
 @POLICIES
-def test_long_darkness_starts_anew_where_it_ended(frames, policy):
-    result = checked(blinded(frames, 18, 10, 0), policy)
+def test_many_black_images_restart_at_the_last_pose(frames, policy):
+    result = run_and_check(with_blank_images(frames, 18, 10, 0), policy)
     assert set(result.statuses[18:28]) == {'lost'}
     assert set(result.statuses[32:]) == {'ok'}
-    sure = np.median([np.trace(update.covariance) for update in result.updates[8:18]])
-    # Nobody saw how far the camera went meanwhile: that stays unknown, not what it does next.
-    assert min(np.trace(update.covariance) for update in result.updates[18:]) > 100.0 * sure
-    assert np.trace(result.updates[-1].window_covariance) < 10.0 * sure
+    usual = np.median([np.trace(update.covariance) for update in result.updates[8:18]])
+    # The motion while lost is unobserved: its uncertainty stays, that of later windows is small.
+    assert min(np.trace(update.covariance) for update in result.updates[18:]) > 100.0 * usual
+    assert np.trace(result.updates[-1].window_covariance) < 10.0 * usual
     assert steps(result).max() < 6.0
     assert relative_error(result, list(range(18))) < 0.02
-    # The segment after it has the shape of the truth; of its scale only the depths told.
+    # The segment after it has the shape of the truth; its scale follows from the depths alone.
     assert relative_error(result, list(range(30, COUNT))) < 0.05
 
 
 @POLICIES
-def test_a_cut_to_another_scene_keeps_one_piece(frames, policy):
+def test_a_cut_to_another_scene_keeps_one_trajectory(frames, policy):
     other = frames_of(5, COUNT)
     joined = restamped([frame.image for frame in (*frames[:30], *other[:40])], frames[0].camera)
-    result = checked(joined, policy)
+    result = run_and_check(joined, policy)
     assert 'lost' in result.statuses[30:36]
     assert set(result.statuses[45:]) == {'ok'}
     assert steps(result).max() < 6.0
@@ -120,48 +122,49 @@ def test_a_cut_to_another_scene_keeps_one_piece(frames, policy):
     assert moved > 3.0 * np.median(np.linalg.norm(np.diff(result.poses[:, :3, 3], axis=0), axis=1))
 
 
-def test_poses_go_on_becoming_final_after_a_new_start():
-    """What hangs on keyframes of the old window must not wait, or hold memory, for ever."""
+def test_poses_become_final_after_a_restart():
+    """Frames relative to keyframes of the old window must not stay pending, nor hold memory."""
     first, other = frames_of(0, COUNT), frames_of(5, COUNT)
     joined = restamped([frame.image for frame in (*first[:20], *other)], first[0].camera)
     odometry = KeyframeOdometry(GeometricBackbone(), EveryFrame())
-    waiting = []
+    pending = []
     for frame in joined:
         odometry.process(frame)
-        waiting.append(len(odometry.pending))
-    assert max(waiting) < 2 * WINDOW_SIZE + 8
-    assert waiting[-1] == WINDOW_SIZE - 1
+        pending.append(len(odometry.pending))
+    assert max(pending) < 2 * WINDOW_SIZE + 8
+    assert pending[-1] == WINDOW_SIZE - 1
 
 
 @POLICIES
-def test_repeated_frames_in_the_middle(frames, policy):
+def test_repeated_images_stand_still(frames, policy):
     images = [frame.image for frame in frames]
     repeated = [*images[:20], *[images[19]] * 12, *images[20:]]
-    result = checked(restamped(repeated, frames[0].camera), policy)
+    result = run_and_check(restamped(repeated, frames[0].camera), policy)
     assert 'lost' not in result.statuses
     still = result.poses[20:32, :3, 3]
     usual = np.median(np.linalg.norm(np.diff(result.poses[:20, :3, 3], axis=0), axis=1))
     assert np.linalg.norm(still - still[0], axis=1).max() < 0.5 * usual
     truth = SyntheticSequence(0, 'smooth', COUNT).ground_truth().trajectory
-    seeing = [*range(20), *range(32, COUNT + 12)]
+    visible = [*range(20), *range(32, COUNT + 12)]
     error = metrics.absolute_trajectory_error(
-        Trajectory(truth.stamps_ns, result.poses[seeing]), truth)
+        Trajectory(truth.stamps_ns, result.poses[visible]), truth)
     assert error.rmse < 0.02 * error.path_length
 
 
-def test_doubled_frames(frames):
+def test_every_image_twice(frames):
     doubled = [frame.image for frame in frames[:20] for _ in range(2)]
-    result = checked(restamped(doubled, frames[0].camera))
+    result = run_and_check(restamped(doubled, frames[0].camera))
     assert 'lost' not in result.statuses
-    assert relative_error(Run([], result.final[::2], []), list(range(20))) < 0.03
+    assert relative_error(OdometryRun([], result.final[::2], []), list(range(20))) < 0.03
 
 
-@pytest.mark.parametrize(('policy', 'noise'), [(EveryFrame, 0.0), (EveryFrame, 4.0), (Survival, 4.0)])
+@pytest.mark.parametrize(('policy', 'noise'), [
+    (EveryFrame, 0.0), (EveryFrame, 4.0), (Survival, 4.0)])
 def test_standstill_from_the_start(frames, policy, noise):
     rng = np.random.default_rng(0)
     images = [np.clip(frames[0].image + noise * rng.normal(size=frames[0].image.shape), 0, 255
                       ).astype(np.uint8) for _ in range(24)]
-    result = checked(restamped(images, frames[0].camera), policy)
+    result = run_and_check(restamped(images, frames[0].camera), policy)
     assert 'lost' not in result.statuses
     assert set(result.statuses[1:]) == {'held'}
     depth = np.median([update.median_depth for update in result.updates[1:]])
@@ -172,8 +175,8 @@ def test_standstill_from_the_start(frames, policy, noise):
 CAMERA = Camera(320, 240, 400.0, 400.0, 159.5, 119.5)
 
 
-def turned_images(angles: np.ndarray) -> list[np.ndarray]:
-    """Return what a camera that turns by angles (N, 3) [rad] sees from one place."""
+def rotated_images(angles: np.ndarray) -> list[np.ndarray]:
+    """Return images of a camera that rotates by angles (N, 3) [rad] on the spot."""
     sequence = SyntheticSequence(0, 'smooth', 1)
     wide, image = sequence.camera, sequence.frame(0).image
     result = []
@@ -187,7 +190,7 @@ def turned_images(angles: np.ndarray) -> list[np.ndarray]:
 def test_pure_rotation_from_the_start():
     along = np.linspace(0.0, 1.0, 30)[:, None]
     angles = (along - 0.5) * np.array([0.06, 0.35, 0.1])
-    result = checked(restamped(turned_images(angles), CAMERA))
+    result = run_and_check(restamped(rotated_images(angles), CAMERA))
     assert 'lost' not in result.statuses
     assert result.statuses.count('held') > 20
     truth = geometry.exp_so3(angles)
@@ -199,8 +202,8 @@ def test_pure_rotation_from_the_start():
 
 
 @POLICIES
-def test_turning_on_the_spot_and_back_after_moving(frames, policy):
-    """Seen from one place, the last image turns away and back: the camera is where it was."""
+def test_rotation_and_back_after_translation(frames, policy):
+    """The last image is warped by a rotation and back: the camera does not translate."""
     sequence = SyntheticSequence(0, 'smooth', 26)
     images = [frame.image for frame in frames[:26]]
     swing = 0.06 * np.sin(np.linspace(0.0, np.pi, 14))
@@ -210,7 +213,7 @@ def test_turning_on_the_spot_and_back_after_moving(frames, policy):
         H = sequence.camera.matrix @ R @ np.linalg.inv(K)
         images.append(cv2.warpPerspective(last.image, H, (320, 240),
                                           flags=cv2.INTER_AREA | cv2.WARP_INVERSE_MAP))
-    result = checked(restamped(images, frames[0].camera), policy)
+    result = run_and_check(restamped(images, frames[0].camera), policy)
     assert 'lost' not in result.statuses
     turn = result.poses[26:]
     travelled = np.linalg.norm(result.poses[25, :3, 3] - result.poses[0, :3, 3])
@@ -221,7 +224,7 @@ def test_turning_on_the_spot_and_back_after_moving(frames, policy):
 
 @pytest.mark.parametrize('count', [1, 2, 3])
 def test_very_short_sequences(frames, count):
-    result = checked(frames[:count])
+    result = run_and_check(frames[:count])
     assert np.array_equal(result.poses[0], np.eye(4))
     assert [update.is_keyframe for update in result.updates] == [True] * count
     assert result.updates[0].final == ()
@@ -229,59 +232,59 @@ def test_very_short_sequences(frames, count):
 
 @pytest.mark.parametrize(('width', 'height'), [(64, 48), (32, 24), (16, 12), (3, 2)])
 def test_tiny_images(width, height):
-    checked(list(SyntheticSequence(3, 'smooth', 20, width, height)))
+    run_and_check(list(SyntheticSequence(3, 'smooth', 20, width, height)))
 
 
-def test_noise_without_any_motion_in_it():
-    """Sooner or later: short tracks that are found nearby by chance fit many a motion."""
+def test_independent_noise_images_are_lost():
+    """Not in every frame: short tracks that are found nearby by chance fit some motion."""
     camera, statuses = Camera(160, 120, 150.0, 150.0, 79.5, 59.5), []
     for seed in range(3):
         rng = np.random.default_rng(seed)
         images = [rng.integers(0, 256, (120, 160), dtype=np.uint8) for _ in range(60)]
-        statuses += checked(restamped(images, camera)).statuses
+        statuses += run_and_check(restamped(images, camera)).statuses
     assert 'lost' in statuses
 
 
-def test_a_wall_with_a_few_corners():
-    """Nearly no texture: a handful of dots is too little to be trusted or to fail on."""
+def test_few_corners_give_finite_poses():
+    """Five dots are too few to be tracked reliably, and must not raise an error."""
     images = []
     for index in range(20):
         image = np.full((240, 320), 120, dtype=np.uint8)
         for x, y in [(60, 60), (200, 80), (120, 170), (260, 190), (90, 120)]:
             cv2.circle(image, (x + 3 * index, y), 6, 20, -1)
         images.append(image)
-    checked(restamped(images, CAMERA))
+    run_and_check(restamped(images, CAMERA))
 
 
-def test_a_plane_is_followed():
-    """All points on one plane, the classic degeneracy of the fundamental matrix."""
+def test_a_planar_scene_is_tracked():
+    """All points on one plane: a degeneracy of the fundamental matrix."""
     texture = cv2.GaussianBlur(np.random.default_rng(0).integers(
         0, 256, (480, 640), dtype=np.uint8), (0, 0), 2.0)
     texture = cv2.normalize(texture, None, 0, 255, cv2.NORM_MINMAX)
     images = [np.ascontiguousarray(texture[40:280, 40 + 6 * n:360 + 6 * n]) for n in range(30)]
-    result = checked(restamped(images, CAMERA))
+    result = run_and_check(restamped(images, CAMERA))
     assert 'lost' not in result.statuses
     steps_taken = np.linalg.norm(np.diff(result.poses[:, :3, 3], axis=0), axis=1)
     assert steps_taken.max() < 4.0 * np.median(steps_taken)
 
 
-def test_images_of_another_size_are_refused_in_one_line(frames):
+def test_images_of_another_size_are_an_error(frames):
     odometry = KeyframeOdometry(GeometricBackbone(), Survival())
-    final = [placed for frame in frames[:9] for placed in odometry.process(frame).final]
+    final = [frame_pose for frame in frames[:9] for frame_pose in odometry.process(frame).final]
     small = Frame(frames[9].stamp_ns, frames[9].image[:120, :160], frames[9].camera)
-    with pytest.raises(KfvoError, match='320x240.*160x120') as refused:
+    with pytest.raises(KfvoError, match='320x240.*160x120') as error:
         odometry.process(small)
-    assert '\n' not in str(refused.value)
-    final += odometry.process(frames[10]).final  # and those of the right size go on
+    assert '\n' not in str(error.value)
+    final += odometry.process(frames[10]).final  # the right size is still accepted
     assert len(final) + len(odometry.finish()) == 10
 
 
-def test_a_camera_without_calibration_is_refused(frames):
+def test_a_camera_without_calibration_is_an_error(frames):
     with pytest.raises(KfvoError, match='calibrat'):
         run([Frame(RATE_NS, frames[0].image, None)])
 
 
-def test_colour_images_are_seen_as_grey(frames):
+def test_colour_images_are_converted_to_grey(frames):
     colour = [with_image(frame, np.repeat(frame.image[..., None], 3, axis=2))
               for frame in frames[:10]]
     np.testing.assert_allclose(run(colour).poses, run(frames[:10]).poses, atol=1e-9)

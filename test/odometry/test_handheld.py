@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Turning on the spot and hovering, as people and robots do: little parallax, and much noise."""
+"""Hand-held rotation and hovering: little parallax and much noise."""
 
 from __future__ import annotations
 
@@ -25,34 +25,34 @@ from kfvo_ros.trajectory import Trajectory
 CAMERA = Camera(640, 480, 520.0, 520.0, 319.5, 239.5)
 FRAMES, POINTS, TRACKS, NOISE = 240, 6000, 300, 0.3
 NO_IMAGE = np.zeros((0, 0), dtype=np.uint8)
-DEATHS = 0.03
-"""Share of the tracks that end at every frame, of those still in the image."""
+LOSS_SHARE = 0.03
+"""Share of the tracks in the image that are lost at every frame."""
 
 
-def wave(rng: np.random.Generator, size: float) -> np.ndarray:
+def random_wave(rng: np.random.Generator, size: float) -> np.ndarray:
     """Return a sum of slow sines (FRAMES, 3)."""
     phases, turns = rng.uniform(0.0, 2.0 * np.pi, (6, 3)), rng.uniform(0.15, 0.6, (6, 3))
     seconds = np.arange(FRAMES)[:, None, None] / 30.0
     return size * np.sin(2.0 * np.pi * turns * seconds + phases).sum(axis=1) / np.sqrt(3.0)
 
 
-def points_around(rng: np.random.Generator) -> np.ndarray:
+def random_points(rng: np.random.Generator) -> np.ndarray:
     """Return points (POINTS, 3) in all directions, at 1.2 to 4 m."""
     points = rng.normal(size=(POINTS, 3))
     return points * (rng.uniform(1.2, 4.0, (POINTS, 1))
                      / np.linalg.norm(points, axis=1, keepdims=True))
 
 
-def tracks_of(rng: np.random.Generator, points: np.ndarray, T_world_camera: np.ndarray,
+def project(rng: np.random.Generator, points: np.ndarray, T_world_camera: np.ndarray,
               noise: float = NOISE) -> Iterator[Tracks]:
-    """Yield what is seen of the points, `noise` [px] off in each axis."""
+    """Yield the tracks of visible points with `noise` [px] per axis."""
     ids, count = np.full(POINTS, -1), 0
     for T_camera_world in geometry.invert(T_world_camera):
         x, y, z = (points @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]).T
         pixels = np.stack([x, y], axis=1) / np.maximum(z, 1e-6)[:, None] * CAMERA.fx
         pixels += (CAMERA.cx, CAMERA.cy)
         seen = (z > 0.1) & ((pixels > 4.0) & (pixels < (636.0, 476.0))).all(axis=1)
-        ids[~seen | (rng.random(POINTS) < DEATHS)] = -1
+        ids[~seen | (rng.random(POINTS) < LOSS_SHARE)] = -1
         born = rng.permutation(np.flatnonzero(seen & (ids < 0)))[:TRACKS - (ids >= 0).sum()]
         ids[born] = np.arange(count, count + len(born))
         count += len(born)
@@ -61,36 +61,37 @@ def tracks_of(rng: np.random.Generator, points: np.ndarray, T_world_camera: np.n
         yield certain_tracks(ids[rows], pixels[rows] + noise * rng.normal(size=(len(rows), 2)))
 
 
-def replay(tracks_in_turn: Iterable[Tracks]) -> Trajectory:
-    """Return what the odometry makes of tracks, keeping every frame."""
-    backbone, placed = GeometricBackbone(), []
+def replay(tracks_per_frame: Iterable[Tracks]) -> Trajectory:
+    """Return the trajectory of tracks when every frame is a keyframe."""
+    backbone, final_poses = GeometricBackbone(), []
     odometry = KeyframeOdometry(backbone, EveryFrame())
-    for index, tracks in enumerate(tracks_in_turn):
+    for index, tracks in enumerate(tracks_per_frame):
         encoded = Encoded(index * RATE_NS, np.zeros(48, dtype=np.float32),
                           FrameTracks(index, tracks, CAMERA.undistort(tracks.pixels)), tracks)
         window = odometry.encode(Frame(encoded.stamp_ns, NO_IMAGE, CAMERA), encoded)
         odometry.integrate(None if window is None else backbone.estimate([window])[0])
-        placed += odometry.commit(True, {}).final
-    placed += odometry.finish()
-    return Trajectory(np.array([each.stamp_ns for each in placed]),
-                      np.stack([each.T_world_camera for each in placed]))
+        final_poses += odometry.commit(True, {}).final
+    final_poses += odometry.finish()
+    return Trajectory(np.array([each.stamp_ns for each in final_poses]),
+                      np.stack([each.T_world_camera for each in final_poses]))
 
 
-def spread(positions: np.ndarray) -> float:
+def spread_of(positions: np.ndarray) -> float:
     return float(np.linalg.norm(positions - positions.mean(axis=0)))
 
 
-def test_noise_does_not_pass_for_parallax():
-    """Were the hosts' measurements of rays exact, scale would shrink and the error double.
+def test_noise_does_not_act_as_parallax():
+    """The camera rotates by tens of degrees and translates by centimetres, for 8 s.
 
-    The camera turns by tens of degrees and moves by centimetres, for 8 s.
+    If the rays of the host frames were taken as exact, the scale would shrink, the error double.
     """
     drifts, errors = [], []
     for seed in range(3):
         rng = np.random.default_rng(seed)
-        truth = geometry.make_transform(geometry.exp_so3(wave(rng, 0.3)), wave(rng, 0.03))
-        found = replay(tracks_of(rng, points_around(rng), truth))
-        first, last = (spread(truth[part, :3, 3]) / spread(found.poses[part, :3, 3])
+        truth = geometry.make_transform(geometry.exp_so3(random_wave(rng, 0.3)),
+                                        random_wave(rng, 0.03))
+        found = replay(project(rng, random_points(rng), truth))
+        first, last = (spread_of(truth[part, :3, 3]) / spread_of(found.poses[part, :3, 3])
                        for part in (slice(0, 60), slice(-60, None)))
         drifts.append(np.log(last / first))
         errors.append(metrics.absolute_trajectory_error(
@@ -99,8 +100,8 @@ def test_noise_does_not_pass_for_parallax():
     assert np.mean(errors) < 0.008, errors
 
 
-def walk_turn_walk() -> np.ndarray:
-    """Return poses (120, 4, 4): a metre straight on, 50 degrees on the spot, another metre."""
+def walk_turn_walk_poses() -> np.ndarray:
+    """Return poses (120, 4, 4): 1 m forward, 50 degrees on the spot, 1 m forward."""
     pace = np.concatenate([np.full(40, 0.025), np.zeros(40), np.full(40, 0.025)])
     turn = np.concatenate([np.zeros(40), np.full(40, np.radians(1.25)), np.zeros(40)])
     rotations = geometry.exp_so3(np.cumsum(turn)[:, None] * [0.0, 1.0, 0.0])
@@ -108,27 +109,27 @@ def walk_turn_walk() -> np.ndarray:
     return geometry.make_transform(rotations, np.cumsum(pace[:, None] * ahead, axis=0))
 
 
-def test_what_a_turn_brings_into_view_does_not_outvote_the_motion_after_it():
-    """It is supposed to be as far as what was there before, and is thrice as far.
+def test_new_points_after_a_turn_do_not_change_the_scale():
+    """The new points are three times as far as the old ones.
 
-    Half way through it most points are new: no reason to forget the keyframes before.
+    Half way through the turn most points are new; the earlier keyframes must still count.
     """
     drifts = []
     for seed in range(4):
         rng = np.random.default_rng(seed)
-        truth, points = walk_turn_walk(), points_around(rng)
+        truth, points = walk_turn_walk_poses(), random_points(rng)
         points[points[:, 0] > 0.3 * np.linalg.norm(points, axis=1)] *= 3.0
-        found = replay(tracks_of(rng, points, truth))
-        first, last = (spread(truth[part, :3, 3]) / spread(found.poses[part, :3, 3])
+        found = replay(project(rng, points, truth))
+        first, last = (spread_of(truth[part, :3, 3]) / spread_of(found.poses[part, :3, 3])
                        for part in (slice(0, 40), slice(-40, None)))
         drifts.append(np.log(last / first))
     assert np.abs(drifts).mean() < 0.04, drifts
 
 
-def hover_before_a_wall(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def hover_along_a_wall(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Return points (POINTS, 3) of a wall, and poses (120, 4, 4) along it.
 
-    The camera turns by 0.6 degrees per frame while it stands, between two metres of sliding.
+    The camera rotates by 0.6 degrees per frame at standstill, between two translations.
     """
     pace = np.concatenate([np.full(40, 0.03), np.zeros(40), np.full(40, 0.03)])
     pace = np.convolve(np.pad(pace, 5, 'edge'), np.ones(11) / 11, 'valid')
@@ -138,21 +139,22 @@ def hover_before_a_wall(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarra
                                     np.cumsum(pace)[:, None] * [1.0, 0.0, 0.0]))
 
 
-def sliding(rng: np.random.Generator, tracks_in_turn: Iterable[Tracks]) -> Iterator[Tracks]:
-    """Yield tracks that wander from their points, by 0.05 px in each axis from frame to frame."""
-    off = np.zeros((0, 2))
-    for tracks in tracks_in_turn:
-        off = np.concatenate([off, np.zeros((tracks.ids.max() + 1 - len(off), 2))])
-        off += 0.05 * rng.normal(size=off.shape)
-        yield certain_tracks(tracks.ids, tracks.pixels + off[tracks.ids])
+def with_random_walk(rng: np.random.Generator, tracks_per_frame: Iterable[Tracks]
+                     ) -> Iterator[Tracks]:
+    """Yield tracks that drift from their points by a random walk of 0.05 px per axis and frame."""
+    offsets = np.zeros((0, 2))
+    for tracks in tracks_per_frame:
+        offsets = np.concatenate([offsets, np.zeros((tracks.ids.max() + 1 - len(offsets), 2))])
+        offsets += 0.05 * rng.normal(size=offsets.shape)
+        yield certain_tracks(tracks.ids, tracks.pixels + offsets[tracks.ids])
 
 
 @pytest.mark.parametrize('seed', range(3))
-def test_hovering_before_a_wall_keeps_the_scale(seed):
-    """Two motions explain the first frames after it, and the window has no depths to tell."""
+def test_hovering_along_a_wall_keeps_the_scale(seed):
+    """Two motions explain the first frames after it; the window has no depths to decide."""
     rng = np.random.default_rng(seed)
-    points, truth = hover_before_a_wall(rng)
-    found = replay(sliding(rng, tracks_of(rng, points, truth, noise=0.15)))
-    first, last = (spread(truth[part, :3, 3]) / spread(found.poses[part, :3, 3])
+    points, truth = hover_along_a_wall(rng)
+    found = replay(with_random_walk(rng, project(rng, points, truth, noise=0.15)))
+    first, last = (spread_of(truth[part, :3, 3]) / spread_of(found.poses[part, :3, 3])
                    for part in (slice(0, 35), slice(-30, None)))
     assert abs(np.log(last / first)) < 0.05

@@ -9,7 +9,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from odometry_scenes import PATTERN, Run, Scripted, frames_of, run, truth_of
+from odometry_scenes import PATTERN, OdometryRun, ScriptedPolicy, frames_of, run, truth_of
 
 from kfvo_ros import geometry
 from kfvo_ros.backbones.geometric.backbone import GeometricBackbone
@@ -27,46 +27,46 @@ def frames() -> tuple[Frame, ...]:
 
 
 @pytest.fixture(scope='module')
-def survival(frames) -> Run:
+def survival(frames) -> OdometryRun:
     return run(frames)
 
 
 @pytest.fixture(scope='module')
-def scripted(frames) -> Run:
-    return run(frames, Scripted(*PATTERN * 12))
+def scripted(frames) -> OdometryRun:
+    return run(frames, ScriptedPolicy(*PATTERN * 12))
 
 
-def test_every_frame_gets_one_pose_in_input_order(frames, survival, scripted):
+def test_every_frame_has_one_pose_in_input_order(frames, survival, scripted):
     for result in (survival, scripted, run(frames[:20], EveryFrame())):
         stamps = [update.stamp_ns for update in result.updates]
-        assert [placed.stamp_ns for placed in result.final] == stamps
+        assert [frame_pose.stamp_ns for frame_pose in result.final] == stamps
         assert stamps == [frame.stamp_ns for frame in frames[:len(stamps)]]
 
 
-def test_the_world_is_the_first_camera(survival):
+def test_the_first_camera_is_the_world(survival):
     assert np.array_equal(survival.updates[0].T_world_camera, np.eye(4))
     assert np.array_equal(survival.final[0].T_world_camera, np.eye(4))
 
 
-def test_trajectory_follows_the_truth(frames, survival):
+def test_trajectory_is_close_to_the_truth(frames, survival):
     truth = truth_of(0, COUNT)
     error = metrics.absolute_trajectory_error(survival.trajectory, truth)
     assert error.rmse < 0.01 * error.path_length
-    turned = metrics.relative_pose_error(survival.trajectory, truth, 10, 'frames')
-    assert turned.rot_rmse_deg < 0.8  # [deg] over 10 frames at 320x240
+    relative = metrics.relative_pose_error(survival.trajectory, truth, 10, 'frames')
+    assert relative.rot_rmse_deg < 0.8  # [deg] over 10 frames at 320x240
     assert set(survival.statuses) == {'ok'}
 
 
-def test_rotations_do_not_wear_off(frames):
-    """What months of products would do is done at once; it is gone after the next keyframe."""
+def test_rotations_are_orthonormalised(frames):
+    """Errors of rotations, as of many products, are removed at the next keyframe."""
     odometry = KeyframeOdometry(GeometricBackbone(), EveryFrame())
     for frame in frames[:12]:
         odometry.process(frame)
     for keyframe in odometry.window:
         keyframe.T_world_camera = keyframe.T_world_camera * (1.0 + 1e-7)
-    worn, mended = (odometry.process(frame).T_world_camera[:3, :3] for frame in frames[12:14])
-    assert np.abs(worn @ worn.T - np.eye(3)).max() > 1e-8
-    assert np.abs(mended @ mended.T - np.eye(3)).max() < 1e-14
+    before, after = (odometry.process(frame).T_world_camera[:3, :3] for frame in frames[12:14])
+    assert np.abs(before @ before.T - np.eye(3)).max() > 1e-8
+    assert np.abs(after @ after.T - np.eye(3)).max() < 1e-14
 
 
 def test_first_seven_are_keyframes_and_then_the_policy_decides(scripted):
@@ -74,16 +74,16 @@ def test_first_seven_are_keyframes_and_then_the_policy_decides(scripted):
     assert kept[:WINDOW_SIZE - 1] == [True] * (WINDOW_SIZE - 1)
     expected = list(itertools.islice(itertools.cycle(PATTERN), COUNT - WINDOW_SIZE + 1))
     assert kept[WINDOW_SIZE - 1:] == expected
-    assert [placed.is_keyframe for placed in scripted.final] == kept
+    assert [frame_pose.is_keyframe for frame_pose in scripted.final] == kept
 
 
-def test_policy_sees_the_whole_window(frames):
-    policy, backbone = Scripted(True, False), GeometricBackbone()
+def test_policy_observes_the_whole_window(frames):
+    policy, backbone = ScriptedPolicy(True, False), GeometricBackbone()
     run(frames[:14], policy, backbone)
-    assert len(policy.seen) == 14 - (WINDOW_SIZE - 1)
-    assert [decision.gap for decision in policy.seen] == [1, 1, 2, 3, 4, 5, 6]
+    assert len(policy.inputs) == 14 - (WINDOW_SIZE - 1)
+    assert [decision.gap for decision in policy.inputs] == [1, 1, 2, 3, 4, 5, 6]
     size = backbone.descriptor_size + 7 * (WINDOW_SIZE - 1) + len(backbone.signal_names)
-    for decision in policy.seen:
+    for decision in policy.inputs:
         assert decision.observation.shape == (size,)
         assert decision.observation.dtype == np.float32
         assert np.isfinite(decision.observation).all()
@@ -91,7 +91,7 @@ def test_policy_sees_the_whole_window(frames):
 
 @pytest.mark.parametrize(('size', 'count'), [(8, 20), (4, 12)])
 def test_window_grows_to_its_size_and_no_further(frames, size, count):
-    odometry = KeyframeOdometry(GeometricBackbone(), Scripted(*PATTERN * 12), None, size)
+    odometry = KeyframeOdometry(GeometricBackbone(), ScriptedPolicy(*PATTERN * 12), None, size)
     sizes = []
     for frame in frames[:count]:
         window = odometry.encode(frame)
@@ -109,8 +109,8 @@ def test_window_grows_to_its_size_and_no_further(frames, size, count):
 def test_final_poses_never_change(survival, scripted):
     for result in (survival, scripted):
         assert len(result.emitted_poses) == COUNT
-        for pose, placed in zip(result.emitted_poses, result.final):
-            assert pose.tobytes() == placed.T_world_camera.tobytes()
+        for pose, frame_pose in zip(result.emitted_poses, result.final):
+            assert pose.tobytes() == frame_pose.T_world_camera.tobytes()
 
 
 def test_poses_become_final_when_their_keyframe_leaves_the_window(scripted):
@@ -125,7 +125,7 @@ def test_poses_become_final_when_their_keyframe_leaves_the_window(scripted):
 
 
 def test_dropped_frame_follows_its_keyframe(frames):
-    odometry = KeyframeOdometry(GeometricBackbone(), Scripted(True, True, False, True))
+    odometry = KeyframeOdometry(GeometricBackbone(), ScriptedPolicy(True, True, False, True))
     for frame in frames[:10]:
         update = odometry.process(frame)
     keyframe, dropped = odometry.pending[-2:]
@@ -139,7 +139,7 @@ def test_dropped_frame_follows_its_keyframe(frames):
     np.testing.assert_allclose(geometry.relative(*before), geometry.relative(*after), atol=1e-12)
 
 
-def test_steps_one_by_one_are_process(frames, survival):
+def test_the_single_steps_equal_process(frames, survival):
     odometry = KeyframeOdometry(GeometricBackbone(), Survival())
     for frame, expected in zip(frames[:25], survival.updates):
         window = odometry.encode(frame)
@@ -153,14 +153,14 @@ def test_steps_one_by_one_are_process(frames, survival):
 
 
 def test_same_seed_same_bytes(frames, survival):
-    def arrivals(result: Run) -> bytes:
+    def arrivals(result: OdometryRun) -> bytes:
         return np.stack([update.T_world_camera for update in result.updates[:30]]).tobytes()
 
     assert arrivals(run(frames[:30])) == arrivals(survival)
     assert arrivals(run(frames[:30], backbone=GeometricBackbone(3))) != arrivals(survival)
 
 
-def test_two_odometries_batched_on_one_backbone_equal_two_runs(frames, survival):
+def test_two_odometries_batched_on_one_backbone_equal_separate_runs(frames, survival):
     others = frames_of(1, COUNT)
     backbone = GeometricBackbone()
     odometries = [KeyframeOdometry(backbone, Survival()) for _ in range(2)]
@@ -168,18 +168,18 @@ def test_two_odometries_batched_on_one_backbone_equal_two_runs(frames, survival)
     for pair in zip(frames[:25], others):
         windows = [odometry.encode(frame) for odometry, frame in zip(odometries, pair)]
         estimates = backbone.estimate(windows) if all(windows) else [None, None]
-        for odometry, estimate, taken in zip(odometries, estimates, poses):
+        for odometry, estimate, estimated in zip(odometries, estimates, poses):
             step = odometry.integrate(estimate)
             keep = step.keep if step.decision is None else odometry.policy.decide(step.decision)
-            taken.append(odometry.commit(keep, {}).T_world_camera)
+            estimated.append(odometry.commit(keep, {}).T_world_camera)
     alone = [survival, run(others[:25])]
-    for taken, result in zip(poses, alone):
+    for estimated, result in zip(poses, alone):
         expected = [update.T_world_camera for update in result.updates[:25]]
-        assert np.stack(taken).tobytes() == np.stack(expected).tobytes()
+        assert np.stack(estimated).tobytes() == np.stack(expected).tobytes()
 
 
 @pytest.mark.parametrize('rule', ['none', 'translation', 'depth'])
-def test_every_scale_rule_gives_a_trajectory(frames, rule):
+def test_every_scale_rule_tracks(frames, rule):
     result = run(frames[:40], scale_rule=rule)
     error = metrics.absolute_trajectory_error(result.trajectory, truth_of(0, COUNT))
     assert error.rmse < 0.03 * error.path_length
@@ -193,7 +193,7 @@ def test_policies_choose_keyframes(frames, policy):
     assert keyframes == 40 if policy is EveryFrame else WINDOW_SIZE <= keyframes < 35
 
 
-def test_update_tells_covariance_depth_and_durations(survival):
+def test_update_has_covariance_depth_and_durations(survival):
     for update in survival.updates[1:]:
         assert set(update.durations) == {'encode', 'estimate', 'decide'}
         assert min(update.durations.values()) >= 0.0
@@ -205,7 +205,7 @@ def test_update_tells_covariance_depth_and_durations(survival):
     assert survival.updates[0].median_depth is None
 
 
-def test_without_covariance_all_else_is_the_same(frames, survival):
+def test_with_covariance_changes_nothing_else(frames, survival):
     plain = run(frames[:20], with_covariance=False)
     for update, expected in zip(plain.updates, survival.updates, strict=False):
         assert update.T_world_camera.tobytes() == expected.T_world_camera.tobytes()
@@ -214,9 +214,9 @@ def test_without_covariance_all_else_is_the_same(frames, survival):
     assert survival.updates[19].covariance.any()
 
 
-def test_finish_hands_out_each_frame_once(frames):
+def test_finish_returns_each_frame_once(frames):
     odometry = KeyframeOdometry(GeometricBackbone(), Survival())
-    early = [placed for frame in frames[:9] for placed in odometry.process(frame).final]
+    early = [frame_pose for frame in frames[:9] for frame_pose in odometry.process(frame).final]
     assert len(early) + len(odometry.pending) == 9
     assert len(early) + len(odometry.finish()) == 9
     assert odometry.finish() == ()

@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The method with a backbone like VGGT: no points, no tracks, every window in its own unit."""
+"""Odometry with a backbone like VGGT: no points, no tracks, each window in its own unit."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from kfvo_ros.odometry.keyframe_odometry import WINDOW_SIZE
 from kfvo_ros.sequences.base import Frame
 
 
-class Forgetful(Backbone):
-    """A backbone without points, tracks or memory: it sees the world's pose in the stamp."""
+class PosesOnlyBackbone(Backbone):
+    """A backbone without points, tracks or memory, that knows the true pose of each stamp."""
 
-    name = 'forgetful'
+    name = 'poses_only'
     descriptor_size = 1
 
     def __init__(self, unit: float) -> None:
@@ -31,13 +31,13 @@ class Forgetful(Backbone):
         backbone = self
         self.opened += 1
 
-        class Plain(Stream):
+        class PosesOnlyStream(Stream):
             def encode(self, frame):
                 return Encoded(frame.stamp_ns, np.ones(1, dtype=np.float32))
 
             def release(self, encoded):
                 backbone.released.append(encoded.stamp_ns)
-        return Plain()
+        return PosesOnlyStream()
 
     def estimate(self, windows):
         result = []
@@ -58,38 +58,38 @@ class Forgetful(Backbone):
 
 
 def frames_by_stamp(count: int) -> list[Frame]:
-    """Return frames whose stamps tell Forgetful where they were taken."""
+    """Return frames whose stamps PosesOnlyBackbone maps to poses."""
     frames = frames_of(0, 60)
     return restamped([frame.image for frame in frames[:count]], frames[0].camera)
 
 
-def test_a_backbone_without_points_or_tracks():
-    """VGGT's way: every window in a unit of its own, the tracker only for the policy."""
-    backbone = Forgetful(3.0)
-    given = frames_by_stamp(40)
-    result = run(given, Survival(), backbone)
-    truth = np.stack([Forgetful.pose(frame.stamp_ns) for frame in given])
+def test_backbone_without_points_or_tracks():
+    """As of VGGT: each window has its own unit, and only the policy needs the tracker."""
+    backbone = PosesOnlyBackbone(3.0)
+    frames = frames_by_stamp(40)
+    result = run(frames, Survival(), backbone)
+    truth = np.stack([PosesOnlyBackbone.pose(frame.stamp_ns) for frame in frames])
     fit = geometry.umeyama(result.poses[:, :3, 3], truth[:, :3, 3])
     np.testing.assert_allclose(fit.transform_points(result.poses[:, :3, 3]), truth[:, :3, 3],
                                atol=1e-6)
     assert backbone.opened == 1
     assert all(update.median_depth is None for update in result.updates)
-    # What left the window was released, once; what is still in it was not.
+    # Frames that left the window are released once, those in the window are not.
     dropped = [update.stamp_ns for update in result.updates if not update.is_keyframe]
     kept = [update.stamp_ns for update in result.updates if update.is_keyframe]
     assert 0 < len(dropped) < 33
     assert sorted(backbone.released) == sorted(dropped + kept[:-(WINDOW_SIZE - 1)])
 
 
-def test_scale_rule_none_trusts_the_window():
-    given = frames_by_stamp(20)
-    trusting = run(given, EveryFrame(), Forgetful(3.0), scale_rule='none')
-    aligned = run(given, EveryFrame(), Forgetful(3.0))
-    truth = np.stack([Forgetful.pose(frame.stamp_ns) for frame in given])[:, :3, 3]
+def test_scale_rule_none_keeps_the_unit_of_each_window():
+    frames = frames_by_stamp(20)
+    unaligned = run(frames, EveryFrame(), PosesOnlyBackbone(3.0), scale_rule='none')
+    aligned = run(frames, EveryFrame(), PosesOnlyBackbone(3.0))
+    truth = np.stack([PosesOnlyBackbone.pose(frame.stamp_ns) for frame in frames])[:, :3, 3]
 
     def misfit(result):
         positions = result.poses[:, :3, 3]
         fitted = geometry.umeyama(positions, truth).transform_points(positions)
         return np.abs(fitted - truth).max()
 
-    assert misfit(aligned) < 1e-6 < 0.1 < misfit(trusting)
+    assert misfit(aligned) < 1e-6 < 0.1 < misfit(unaligned)

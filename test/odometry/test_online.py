@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Odometry as it runs: its growing trajectory file, its path, and its doubts."""
+"""Online odometry: growing trajectory file, path and covariance."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from kfvo_ros.backbones.base import Status
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.odometry.factory import make_odometry
 from kfvo_ros.odometry.online import (
-    LEAST_VARIANCE,
+    MIN_VARIANCE,
     SPREAD_MEMORY,
     OnlineOdometry,
     TrajectoryLog,
@@ -33,17 +33,17 @@ POSES = [geometry.make_transform(geometry.exp_so3(np.array([0.3, -1.2, 0.5]) * i
 
 
 @cache
-def make_frames() -> tuple[Frame, ...]:
-    """Render a smooth walk, once."""
+def rendered_frames() -> tuple[Frame, ...]:
+    """Return rendered frames of smooth motion, the same objects at every call."""
     return tuple(SyntheticSequence(0, 'smooth', COUNT, 320, 240))
 
 
-def test_log_grows_on_disk_and_is_saved_with_what_is_not_final(tmp_path):
+def test_log_grows_on_disk_and_is_saved_with_pending_poses(tmp_path):
     log = TrajectoryLog(tmp_path / 'new' / 'walk.tum')
     log.append([(1, POSES[0]), (2, POSES[1])])
     assert list(read_tum(log.path).stamps_ns) == [1, 2]
     assert log.save(tmp_path / 'copy.tum', [(3, POSES[2])]) == 3
-    log.append([(4, POSES[0])])  # after a copy it goes on at the end
+    log.append([(4, POSES[0])])  # appended at the end, also after a copy
     log.close()
     assert list(read_tum(log.path).stamps_ns) == [1, 2, 4]
     copy = read_tum(tmp_path / 'copy.tum')
@@ -51,7 +51,7 @@ def test_log_grows_on_disk_and_is_saved_with_what_is_not_final(tmp_path):
     np.testing.assert_allclose(copy.poses, POSES, atol=1e-9)
 
 
-def test_log_overwrites_nothing_and_leaves_no_empty_file(tmp_path):
+def test_log_never_overwrites_and_deletes_an_empty_file(tmp_path):
     taken = tmp_path / 'walk.tum'
     taken.write_text('mine')
     for create in (TrajectoryLog, lambda path: TrajectoryLog().save(path, [(1, POSES[0])])):
@@ -68,7 +68,7 @@ def test_log_overwrites_nothing_and_leaves_no_empty_file(tmp_path):
 
 
 def test_log_survives_a_full_disk(tmp_path):
-    """A limit on the size of files stands in for it: writing fails in the same place."""
+    """A limit on file sizes simulates it: writing fails in the same place."""
     log = TrajectoryLog(tmp_path / 'walk.tum')
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100, limits[1]))
@@ -82,28 +82,28 @@ def test_log_survives_a_full_disk(tmp_path):
                                 'File too large')
 
 
-def test_path_is_the_newest_of_the_poses_in_metres():
+def test_path_is_the_latest_poses_in_metres():
     whole, short = (OnlineOdometry(make_odometry(OdometryOptions()), TrajectoryLog(), 2.0, length)
                     for length in (None, 5))
-    for frame in make_frames()[:20]:
+    for frame in rendered_frames()[:20]:
         whole.process(frame)
         last = short.process(frame)
         assert len(short.path()) <= 5
     stamps = [stamp for stamp, _ in whole.path()]
-    assert stamps == [frame.stamp_ns for frame in make_frames()[:20]]
+    assert stamps == [frame.stamp_ns for frame in rendered_frames()[:20]]
     assert [stamp for stamp, _ in short.path()] == stamps[-5:]
     np.testing.assert_allclose(short.path()[-1][1], last.T_world_camera, atol=1e-9)
 
 
-def test_doubt_is_the_backbones_and_what_windows_disagreed_on():
-    """In metres; at first no pose is final, and nothing is known of disagreement."""
+def test_covariance_is_the_sum_of_backbone_and_spread():
+    """In metres; while no pose is final the spread is zero."""
     scale = np.repeat([3.0, 1.0], 3)
-    live = OnlineOdometry(make_odometry(OdometryOptions()), TrajectoryLog(), 3.0)
+    running = OnlineOdometry(make_odometry(OdometryOptions()), TrajectoryLog(), 3.0)
     odometry, spreads = make_odometry(OdometryOptions()), []
-    for frame in make_frames():
-        pose, update = live.process(frame), odometry.process(frame)
+    for frame in rendered_frames():
+        pose, update = running.process(frame), odometry.process(frame)
         spread, of_motion = (
-            found - np.outer(scale, scale) * given - LEAST_VARIANCE * np.eye(6)
+            found - np.outer(scale, scale) * given - MIN_VARIANCE * np.eye(6)
             for found, given in ((pose.covariance, update.covariance),
                                  (pose.motion_covariance, update.window_covariance)))
         np.testing.assert_allclose(spread, of_motion, atol=1e-12)
@@ -113,10 +113,10 @@ def test_doubt_is_the_backbones_and_what_windows_disagreed_on():
 
 
 def test_the_spread_between_windows_is_in_world_axes():
-    """A frame that faces sideways and is refined by a turn about the world's z."""
+    """A frame that faces sideways is refined by a rotation about z of the world."""
 
-    class Steps:
-        """Gives one frame, whose pose becomes final with a correction."""
+    class CorrectingOdometry:
+        """Returns frames whose poses become final with a correction."""
 
         pending: tuple = ()
 
@@ -136,10 +136,10 @@ def test_the_spread_between_windows_is_in_world_axes():
                                      np.array([0.0, 0.0, 0.0]))
     correction = geometry.make_transform(geometry.exp_so3(np.array([0.0, 0.0, 0.1])),
                                          np.array([0.2, 0.0, 0.0]))
-    online = OnlineOdometry(Steps(), TrajectoryLog())
+    online = OnlineOdometry(CorrectingOdometry(), TrajectoryLog())
     online.process(Frame(1, np.zeros((2, 2), dtype=np.uint8), None))
     pose = online.process(Frame(2, np.zeros((2, 2), dtype=np.uint8), None))
-    variances = np.diag(pose.covariance) - LEAST_VARIANCE
+    variances = np.diag(pose.covariance) - MIN_VARIANCE
     np.testing.assert_allclose(variances, SPREAD_MEMORY * np.array([0.04, 0, 0, 0, 0, 0.01]),
                                atol=1e-12)
     assert pose.covariance[0, 5] == pytest.approx(SPREAD_MEMORY * 0.2 * 0.1)

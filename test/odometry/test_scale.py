@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The scale of a window against the trajectory, by every rule."""
+"""Scale of a window relative to the trajectory, by each rule."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from kfvo_ros import geometry
 from kfvo_ros.backbones.base import Estimate, Points, WindowPrior
 from kfvo_ros.odometry.scale import (
-    LEAST_AGREEMENT,
+    MIN_AGREEMENT,
     MIN_SHARED_POINTS,
     SCALE_RULES,
     STANDSTILL,
@@ -49,17 +49,17 @@ def prior(with_points: bool = True) -> WindowPrior:
     return WindowPrior(poses(1.0)[:7], np.eye(4), points() if with_points else None)
 
 
-def test_rules_are_those_of_the_paper_and_depth():
+def test_names_of_the_rules():
     assert SCALE_RULES == ('none', 'translation', 'depth')
 
 
 @pytest.mark.parametrize(('rule', 'expected'), [('none', 1.0), ('translation', 2.5),
                                                 ('depth', 2.5)])
-def test_unit_of_a_window_is_found(rule, expected):
+def test_unit_of_a_window_is_estimated(rule, expected):
     assert ScaleAligner(rule).align(estimate(2.5), prior()) == pytest.approx(expected)
 
 
-def test_each_rule_looks_at_its_own_evidence():
+def test_each_rule_uses_its_own_measurement():
     contradictory = estimate(2.0, translations=1.0 / 3.0)
     assert ScaleAligner('depth').align(contradictory, prior()) == pytest.approx(2.0)
     assert ScaleAligner('translation').align(contradictory, prior()) == pytest.approx(3.0)
@@ -77,28 +77,28 @@ def test_standstill_keeps_the_last_scale():
     aligner = ScaleAligner('translation')
     assert aligner.align(estimate(2.5), prior()) == pytest.approx(2.5)
     still = estimate(7.0)
-    still.T_anchor_frame[1:7, :3, 3] *= 1e-5  # the keyframes stand, the newest frame moves
+    still.T_anchor_frame[1:7, :3, 3] *= 1e-5  # only the newest frame moves
     assert aligner.align(still, prior()) == pytest.approx(2.5)
     assert aligner.align(estimate(4.0), prior()) == pytest.approx(4.0)
 
 
-def test_a_window_that_does_not_move_at_all_keeps_the_last_scale():
+def test_a_window_without_motion_keeps_the_last_scale():
     aligner = ScaleAligner('translation')
     aligner.align(estimate(2.5), prior())
     assert aligner.align(estimate(1.0, translations=0.0), prior()) == pytest.approx(2.5)
 
 
-def slide(positions: np.ndarray, noise: float, rng: np.random.Generator) -> list[float]:
-    """Return the scale of each window of a camera (N, 3) that keeps all frames.
+def align_windows(positions: np.ndarray, noise: float, rng: np.random.Generator) -> list[float]:
+    """Return the scale of each window along positions (N, 3) when every frame is a keyframe.
 
-    Every window sees them with noise of its own, as a backbone without points would.
+    Each window has its own noise, as of a backbone without points.
     """
     aligner, known, scales = ScaleAligner('translation'), np.zeros((1, 3)), []
     for newest in range(1, len(positions)):
-        places = positions[max(newest - 7, 0):newest + 1]
-        known = known[-len(places) + 1:]
-        seen = np.tile(np.eye(4), (len(places), 1, 1))
-        seen[1:, :3, 3] = places[1:] - places[0] + noise * rng.normal(size=(len(places) - 1, 3))
+        window = positions[max(newest - 7, 0):newest + 1]
+        known = known[-len(window) + 1:]
+        seen = np.tile(np.eye(4), (len(window), 1, 1))
+        seen[1:, :3, 3] = window[1:] - window[0] + noise * rng.normal(size=(len(window) - 1, 3))
         before = np.tile(np.eye(4), (len(known), 1, 1))
         before[:, :3, 3] = known - known[0]
         scales.append(aligner.align(
@@ -109,15 +109,15 @@ def slide(positions: np.ndarray, noise: float, rng: np.random.Generator) -> list
 
 
 @pytest.mark.parametrize('noise', [1e-6, 1e-3, 3e-3])
-def test_a_long_rest_carries_no_scale_away(noise):
+def test_the_scale_does_not_drift_at_standstill(noise):
     moves = np.concatenate([np.ones(20), np.zeros(100), np.ones(20)])
     positions = np.cumsum(0.05 * moves[:, None] * [1.0, 0.2, 0.3], axis=0)
     for seed in range(10):
-        scales = slide(positions, noise, np.random.default_rng(seed))
+        scales = align_windows(positions, noise, np.random.default_rng(seed))
         assert 0.6 < scales[-1] / scales[17] < 1.6
 
 
-def test_one_image_again_and_again_keeps_the_last_scale():
+def test_a_repeated_image_keeps_the_last_scale():
     aligner = ScaleAligner('translation')
     assert aligner.align(estimate(2.5), prior()) == pytest.approx(2.5)
     known = WindowPrior(np.tile(np.eye(4), (7, 1, 1)), np.eye(4), None)  # all at the anchor
@@ -133,16 +133,17 @@ def test_first_window_starts_at_median_depth_one():
     assert ScaleAligner('none').align(estimate(3.0), None) == 1.0
 
 
-def test_a_new_start_takes_up_the_depth_last_seen():
+def test_a_restart_continues_with_the_last_median_depth():
     aligner = ScaleAligner('depth')
     aligner.align(estimate(2.0), prior())
     depth = 2.0 * np.median(estimate(2.0).points.depths)
-    again = estimate(9.0)
-    assert aligner.align(again, None) * np.median(again.points.depths) == pytest.approx(depth)
-    hint_without_points = WindowPrior(poses(1.0)[:7], np.eye(4), None, memory='something')
-    again = estimate(0.3)
-    scale = aligner.align(again, hint_without_points)
-    assert scale * np.median(again.points.depths) == pytest.approx(depth)
+    restarted = estimate(9.0)
+    scale = aligner.align(restarted, None)
+    assert scale * np.median(restarted.points.depths) == pytest.approx(depth)
+    prior_without_points = WindowPrior(poses(1.0)[:7], np.eye(4), None, memory='something')
+    restarted = estimate(0.3)
+    scale = aligner.align(restarted, prior_without_points)
+    assert scale * np.median(restarted.points.depths) == pytest.approx(depth)
 
 
 def test_translation_rule_is_the_least_squares_ratio():
@@ -158,10 +159,10 @@ def test_translation_rule_is_the_least_squares_ratio():
 def test_depth_rule_is_a_weighted_median():
     known, new = points(), points(0.5)
     wrong = new.positions.copy()
-    wrong[:15] *= 10.0  # fewer than half: they do not matter
+    wrong[:15] *= 10.0  # fewer than half: no influence
     assert compare_depths(known, Points(new.ids, wrong, new.information)) == pytest.approx(2.0)
     wrong = new.positions.copy()
-    wrong[:30] *= 10.0  # the majority, but nobody knows their depths well
+    wrong[:30] *= 10.0  # the majority, but of low information
     information = np.where(np.arange(40) < 30, 0.01, 1.0)
     assert compare_depths(known, Points(new.ids, wrong, information)) == pytest.approx(2.0)
     assert compare_depths(Points(known.ids, known.positions, information),
@@ -176,12 +177,12 @@ def test_points_are_matched_by_id():
                                         new.information[some])) == pytest.approx(2.0)
 
 
-def test_too_few_or_worthless_points_tell_nothing():
+def test_too_few_points_or_no_information_give_none():
     few = points(0.5, MIN_SHARED_POINTS - 1)
     assert compare_depths(points(), few) is None
     assert compare_depths(points(), points(0.5, MIN_SHARED_POINTS)) == pytest.approx(2.0)
-    worthless = points(0.5)
-    assert compare_depths(points(), Points(worthless.ids, worthless.positions,
+    without_information = points(0.5)
+    assert compare_depths(points(), Points(without_information.ids, without_information.positions,
                                            np.zeros(40))) is None
     assert compare_depths(None, few) is None
 
@@ -198,7 +199,7 @@ def test_standstill_is_a_share_of_the_extent(factor, moves):
 
 @pytest.mark.parametrize(('offset', 'agree'), [(0.01, True), (-0.01, False)])
 def test_known_and_new_positions_must_agree(offset, agree):
-    angle = np.arccos(LEAST_AGREEMENT + offset)
+    angle = np.arccos(MIN_AGREEMENT + offset)
     known, new = (np.tile(np.eye(4), (count, 1, 1)) for count in (2, 3))
     known[1, :3, 3] = [3.0, 0.0, 0.0]
     new[1, :3, 3] = [np.cos(angle), np.sin(angle), 0.0]

@@ -197,6 +197,46 @@ def test_a_calibration_file_takes_precedence_over_the_topic(tmp_path):
         assert rig.info.get_subscription_count() == 0
 
 
+def test_camera_info_of_another_size_is_scaled_to_the_image():
+    """The driver resizes its images and publishes the calibration of the whole sensor."""
+    with Rig() as rig:
+        rig.info.publish(to_info(CAMERA.scaled(2 * WIDTH, 2 * HEIGHT)))
+        rig.send(FRAMES[:8], with_info=False)
+        resized = [to_pose(message.pose.pose) for message in rig.odometry(8)]
+        rig.wait_for_line(f'images of {WIDTH}x{HEIGHT}, fx {CAMERA.fx:.1f}, fy {CAMERA.fy:.1f}')
+        rig.wait_for_value('images refused', 0)
+    odometry = make_odometry(OdometryOptions())
+    expected = [base_pose(odometry.process(frame).T_world_camera, T_BODY_OPTICAL)
+                for frame in FRAMES[:8]]
+    np.testing.assert_allclose(resized, expected, atol=1e-6)
+    assert np.abs(expected[-1] - np.eye(4)).max() > 0.01
+
+
+def test_camera_info_of_another_aspect_ratio_is_refused():
+    """It belongs to a crop, whose place in the image is unknown; a right one is used at once."""
+    cropped = to_info(CAMERA)
+    cropped.height = HEIGHT - 40
+    with Rig() as rig:
+        rig.info.publish(cropped)
+        rig.send(FRAMES[:3], with_info=False)
+        line = rig.wait_for_line('[ERROR]')
+        problem = (f'the calibration is for {WIDTH}x{HEIGHT - 40} images, {WIDTH}x{HEIGHT} came; '
+                   'give the calibration of these images')
+        assert problem in line
+        rig.wait_for_value('images refused', 3)
+        assert rig.state()[:2] == (WARN, problem)
+        assert not rig.odometry()
+        rig.info.publish(to_info(CAMERA))
+        time.sleep(0.2)
+        rig.send(FRAMES[3:6], with_info=False)
+        messages = rig.odometry(3)
+        assert [stamp_ns(message) for message in messages] == [
+            frame.stamp_ns for frame in FRAMES[3:6]]
+        assert is_origin(messages[0])
+        rig.wait_for_value('images processed', 3)
+        assert rig.state()[2]['images refused'] == '3' and rig.state()[0] == 0
+
+
 def test_rectified_images_use_p_without_distortion():
     """K and D belong to the raw image; R rotates it to the rectified one."""
     info = to_info(CAMERA)

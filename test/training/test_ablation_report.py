@@ -37,7 +37,8 @@ def test_a_difference_within_the_range_of_the_seeds_is_none(errors, verdict):
 
 
 def test_a_row_without_seeds_is_compared_with_the_range_of_full():
-    rows = FULL + results('every', 1.25, has_seeds=False) + results('survival', 1.35, has_seeds=False)
+    rows = (FULL + results('every', 1.25, has_seeds=False)
+            + results('survival', 1.35, has_seeds=False))
     table = cells(rows)
     assert table['every'] == ['1.250', '50 %', 'none']
     assert table['survival'][-1] == 'worse'

@@ -57,6 +57,14 @@ def test_the_error_is_that_of_the_newest_frame_in_metres(positions):
     assert reward(estimate, truth, keep=False) == pytest.approx(-0.01)
 
 
+@pytest.mark.parametrize(('frame', 'is_aligned'), [(0, True), (4, True), (5, False), (6, False)])
+def test_the_first_five_frames_are_aligned(frame, is_aligned):
+    truth = poses(CURVE)
+    estimate = estimate_of(truth)
+    estimate[frame, :3, 3] += 0.5
+    assert (PaperReward().error(estimate, truth) > 0.01) == is_aligned
+
+
 def test_of_collinear_positions_the_orientations_give_the_rotation():
     truth = poses(LINE)
     truth[-1, :3, 3] += [0.0, 0.5, 0.0]  # the newest frame leaves the line

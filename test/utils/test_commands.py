@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""How every command ends: well, in one line for what users meet, or in a traceback for us."""
+"""Commands: exit status, error messages, signals, --help, and lists of values."""
 
 from __future__ import annotations
 
@@ -13,6 +13,9 @@ import pytest
 from command_lines import ENVIRONMENT, one_readable_line, run_interrupted, run_python
 
 import kfvo_ros
+from kfvo_ros.errors import KfvoError
+from kfvo_ros.sequences import open_sequence
+from kfvo_ros.utils.commands import MAX_SEEDS, expand_ranges, parse_names, parse_numbers
 
 COMMANDS = ('run', 'convert', 'play', 'node', 'demo', 'train', 'ablation', 'benchmark')
 LIGHT_COMMANDS = ('run', 'convert', 'play', 'demo', 'train', 'benchmark')
@@ -31,11 +34,11 @@ sys.exit(run_command('kfvo_test', body, sys.argv[1:], until_stopped={until_stopp
 
 
 def script(body: str, until_stopped: bool = False, before: str = '') -> list[str]:
-    """Return Python's arguments for a command that does this, of one line."""
+    """Return arguments of Python for a command with this body of one line."""
     return ['-c', SCRIPT.format(body=body, until_stopped=until_stopped, before=before)]
 
 
-def test_a_command_that_ends_well():
+def test_success():
     body = 'print(*argv); logging.getLogger("kfvo_ros.part").warning("it is late")'
     done = run_python(*script(body), 'one', 'two')
     assert (done.returncode, done.stdout) == (0, 'one two\n')
@@ -55,7 +58,7 @@ def test_a_command_that_ends_well():
     ('raise ImportError("libGL.so.1:\\n no such file", name="cv2")',
      'cv2 cannot be imported (libGL.so.1: no such file): pip install opencv-python-headless'),
 ])
-def test_what_users_meet_is_told_in_one_line(body, line):
+def test_user_errors_are_one_line(body, line):
     done = run_python(*script(body))
     assert done.returncode == 1
     assert one_readable_line(done).startswith(f'kfvo_test: error: {line}')
@@ -64,7 +67,7 @@ def test_what_users_meet_is_told_in_one_line(body, line):
 @pytest.mark.parametrize(('body', 'last_line'), [
     ('1 / 0', 'ZeroDivisionError: division by zero'),
     ('import kfvo_ros.none', "ModuleNotFoundError: No module named 'kfvo_ros.none'")])
-def test_a_mistake_of_ours_keeps_its_traceback(body, last_line):
+def test_bugs_keep_their_traceback(body, last_line):
     done = run_python(*script(body))
     assert done.returncode == 1 and 'Traceback' in done.stderr
     assert done.stderr.splitlines()[-1] == last_line
@@ -72,8 +75,8 @@ def test_a_mistake_of_ours_keeps_its_traceback(body, last_line):
 
 @pytest.mark.parametrize('body', ['print("result")', 'print("result" * 10000)',
                                   'make_parser("kfvo_test", "Test.").parse_args(["--help"])'])
-def test_output_that_nobody_can_take(body):
-    environment = ENVIRONMENT | {'PYTHONUNBUFFERED': ''}  # where argparse looks away
+def test_stdout_that_cannot_be_written_is_an_error(body):
+    environment = ENVIRONMENT | {'PYTHONUNBUFFERED': ''}  # argparse ignores errors of stdout then
     with open('/dev/full', 'w') as full:
         done = run_python(*script(body), stdout=full, env=environment)
     assert one_readable_line(done) == 'kfvo_test: error: No space left on device'
@@ -89,8 +92,8 @@ def test_output_that_nobody_can_take(body):
 @pytest.mark.parametrize('sent', [signal.SIGINT, signal.SIGTERM])
 def test_signals(sent, until_stopped, tmp_path: Path):
     started = tmp_path / 'started'
-    # A signal just before a sleep is handled after it, so the sleeps are short; one that arrives
-    # while a file object is freed is lost, so there is none.
+    # The sleeps are short, since a signal just before a sleep is handled after it. There is no file
+    # object, since a signal that arrives while one is freed is lost.
     body = (f'os.close(os.open({str(started)!r}, os.O_CREAT)); '
             '[time.sleep(0.05) for _ in range(1200)]')
     status, output, problems = run_interrupted(sent, started.exists,
@@ -100,8 +103,8 @@ def test_signals(sent, until_stopped, tmp_path: Path):
 
 
 @pytest.mark.parametrize('until_stopped', [False, True])
-def test_an_ignored_interruption(until_stopped):
-    """Shells let what a script starts in the background ignore SIGINT."""
+def test_an_ignored_signal(until_stopped):
+    """Background jobs of shell scripts ignore SIGINT."""
     done = run_python(*script('signal.raise_signal(signal.SIGINT); print("went on")',
                               until_stopped, 'signal.signal(signal.SIGINT, signal.SIG_IGN)'))
     assert done.returncode == 0, done.stderr
@@ -109,7 +112,7 @@ def test_an_ignored_interruption(until_stopped):
 
 
 @pytest.mark.parametrize('command', COMMANDS)
-def test_version_and_wrong_arguments(command):
+def test_version_and_invalid_arguments(command):
     if command == 'node':
         pytest.importorskip('rclpy', reason='rclpy is not installed')
     done = run_python('-m', f'kfvo_ros.{command}', '--version')
@@ -120,9 +123,32 @@ def test_version_and_wrong_arguments(command):
 
 
 @pytest.mark.parametrize('command', LIGHT_COMMANDS)
-def test_help_comes_without_what_takes_long_to_import(command):
+def test_help_without_slow_imports(command):
     done = run_python('-X', 'importtime', '-m', f'kfvo_ros.{command}', '--help')
     assert done.returncode == 0 and 'usage' in done.stdout
     imported = {line.rpartition('|')[2].strip() for line in done.stderr.splitlines()}
     assert 'argparse' in imported
     assert not imported & {'numba', 'poselib', 'rosbags', 'tqdm', 'matplotlib', 'rclpy', 'torch'}
+
+
+def test_expand_ranges():
+    texts = expand_ranges(['synthetic:8-10:fast', 'a/path-3-4', 'synthetic:7', 'synthetic:2-2'])
+    assert texts == ('synthetic:8:fast', 'synthetic:9:fast', 'synthetic:10:fast', 'a/path-3-4',
+                     'synthetic:7', 'synthetic:2')
+    assert open_sequence(texts[0]).name == 'synthetic:8:fast'
+
+
+@pytest.mark.parametrize('text', ['synthetic:4-3', f'synthetic:0-{MAX_SEEDS}'])
+def test_empty_and_long_ranges_are_errors(text):
+    with pytest.raises(KfvoError, match=f'expected synthetic:A-B.*{text}'):
+        expand_ranges([text])
+
+
+def test_parse_names_and_numbers():
+    assert parse_names('b,a,b', 'letters', ('a', 'b', 'c')) == ('b', 'a')
+    assert parse_numbers('2,1,2', 'seeds') == (2, 1)
+    with pytest.raises(KfvoError, match="letters: expected names out of a, b, came 'd'"):
+        parse_names('a,d', 'letters', ('a', 'b'))
+    for text in ('', '1,', '1.5', '-1', '²', '0'):
+        with pytest.raises(KfvoError, match='workers: expected whole numbers from 1'):
+            parse_numbers(text, 'workers', 1)

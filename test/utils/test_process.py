@@ -1,12 +1,56 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Information about host and process."""
+"""Threads, memory, durations and host of the process."""
 
 from __future__ import annotations
 
-from kfvo_ros.utils.process import host_info
+import sys
+
+import cv2
+import numpy as np
+import pytest
+from threadpoolctl import threadpool_info
+
+from kfvo_ros.utils.process import (
+    Stopwatch,
+    available_mb,
+    host_info,
+    peak_rss_mb,
+    rss_mb,
+    single_threaded,
+)
 
 
 def test_host_info_names_processor_cores_and_python():
     name = host_info()
     assert 'cores, Python 3.' in name and not name.startswith(',')
+
+
+def test_single_threaded_restores_the_number_of_threads():
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(2)
+    try:
+        with single_threaded():
+            assert cv2.getNumThreads() == 1
+            assert {pool['num_threads'] for pool in threadpool_info()} <= {1}
+        assert cv2.getNumThreads() == 2
+    finally:
+        cv2.setNumThreads(before)
+
+
+@pytest.mark.skipif(sys.platform != 'linux', reason='it reads /proc')
+def test_memory_grows_with_an_array():
+    before = rss_mb()
+    array = np.ones(8 << 20)  # 64 MiB
+    assert array.all() and 60.0 < rss_mb() - before < 80.0
+    assert rss_mb() <= peak_rss_mb() and available_mb() > 0.0
+
+
+def test_stopwatch_adds_durations_by_step(monkeypatch):
+    times = iter([1.0, 3.0, 10.0, 10.5, 20.0, 21.0])
+    monkeypatch.setattr('kfvo_ros.utils.process.time.perf_counter', lambda: next(times))
+    clock = Stopwatch()
+    for step in ('encode', 'decide', 'encode'):
+        with clock(step):
+            pass
+    assert clock.durations == {'encode': 3.0, 'decide': 0.5}

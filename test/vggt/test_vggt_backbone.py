@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from odometry_scenes import Scripted
+from odometry_scenes import ScriptedPolicy
 from vggt_models import (
     WIDTH,
     make_window,
@@ -141,7 +141,7 @@ def test_a_quaternion_of_length_zero_is_lost():
 
 def test_the_odometry_survives_a_model_of_nan():
     backbone = make_broken_backbone(trunk_norm__weight=float('nan'))
-    odometry = KeyframeOdometry(backbone, Scripted(True))
+    odometry = KeyframeOdometry(backbone, ScriptedPolicy(True))
     updates = [odometry.process(frame) for frame in FRAMES]
     assert {update.status for update in updates[1:]} == {Status.LOST}
     assert all(np.isfinite(update.T_world_camera).all() for update in updates)
@@ -242,7 +242,7 @@ class RecordingAligner(ScaleAligner):
 
 def run_aligned(rule: str | None, backbone: VggtBackbone) -> RecordingAligner:
     """Return the aligner of an odometry that keeps every other frame."""
-    odometry = KeyframeOdometry(backbone, Scripted(*[True, False] * 4), rule)
+    odometry = KeyframeOdometry(backbone, ScriptedPolicy(*[True, False] * 4), rule)
     odometry.scale = RecordingAligner(odometry.scale.rule)
     for frame in FRAMES:
         odometry.process(frame)

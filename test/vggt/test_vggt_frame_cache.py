@@ -11,7 +11,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from odometry_scenes import Scripted
+from odometry_scenes import ScriptedPolicy
 from vggt_models import (
     WIDTH,
     Tensor,
@@ -43,7 +43,7 @@ IMAGE_BYTES, TOKENS_BYTES = 4 * 3 * 56 * 70, 4 * (NUM_PREFIX_TOKENS + 4 * 5) * 1
 def iterate_windows(backbone: VggtBackbone, frames: Sequence[Frame], keeps: Sequence[bool]
            ) -> Iterator[Window | None]:
     """Run an odometry as `process` does; yield its window before each estimate."""
-    odometry = KeyframeOdometry(backbone, Scripted(*keeps), window_size=WINDOW)
+    odometry = KeyframeOdometry(backbone, ScriptedPolicy(*keeps), window_size=WINDOW)
     for frame in frames:
         window = odometry.encode(frame)
         yield window
