@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -28,16 +27,13 @@ from kfvo_ros.utils.commands import (
 from kfvo_ros.utils.config import add_arguments, from_arguments, option
 
 if TYPE_CHECKING:
-    from kfvo_ros.backbones.base import Backbone
-    from kfvo_ros.training.ablation import PolicyTest, TrainingRun
-    from kfvo_ros.training.ablation_report import PolicyResult
-    from kfvo_ros.training.plan import TrainingSetup
+    from kfvo_ros.training.ablation import TrainingRun
 
 EXAMPLE = """example:
   python -m kfvo_ros.ablation synthetic:0-39 --validation synthetic:40-49 \\
       --test synthetic:1000-1029 --output ablation
 """
-CSV, MARKDOWN, CURVES, CACHE = 'ablation.csv', 'ablation.md', 'curves.png', 'cache'
+CACHE = 'cache'
 
 
 @dataclass(frozen=True)
@@ -76,78 +72,34 @@ def _ablate(argv: list[str]) -> None:
     arguments = _parse(argv)
     options, split = from_arguments(AblationOptions, arguments), _split_sequences(arguments)
     seeds = parse_numbers(options.seeds, 'seeds')
-    import matplotlib  # noqa: F401  a missing package is an error before hours of training
-    import stable_baselines3  # noqa: F401
-    import tensorboard  # noqa: F401
-
     from kfvo_ros.odometry import factory
+    from kfvo_ros.training.ablation import PolicyTest, TrainingRun, make_setup, read_ablation_rows
+    from kfvo_ros.training.ablation_report import AblationReport
     from kfvo_ros.utils.process import single_threaded
     folder = Path(arguments.output).expanduser()
     options = replace(options, cache=options.cache or str(folder / CACHE))
-    setup = _make_setup(options)
-    with single_threaded():
-        backbone = factory.make_backbone(setup.odometry)
-        runs = list(_plan_runs(setup, options, split, seeds, folder, backbone))
-        for run in runs:
-            run.prepare(options.resume)
-        test = _make_test(setup, split.test, backbone)
-        references = list(test.reference_results(setup.recipe))
-        results: list[PolicyResult] = []
-        for number, run in enumerate(runs, 1):
-            print(f'{number} of {len(runs)}: {run.row}, seed {run.seed}', flush=True)
-            results += _train_and_test(run, split, options, test)
-            _write_report(runs[:number], [*results, *references])
-    print(f'\n{(folder / MARKDOWN).read_text(encoding="utf-8")}\n'
-          f'{folder / MARKDOWN}, {folder / CSV}, {folder / CURVES}')
-
-
-def _make_setup(options: AblationOptions) -> TrainingSetup:
-    """Return what the test and all trainings have in common; raises KfvoError."""
-    from kfvo_ros.odometry.options import OdometryOptions, SequenceOptions, VggtOptions
-    from kfvo_ros.training.config import read_training_config
-    from kfvo_ros.training.plan import TrainingSetup
-    recipe = read_training_config(options.recipe)
-    odometry = OdometryOptions(scale_rule=recipe.scale)
-    return TrainingSetup(odometry.seed, recipe, odometry, SequenceOptions(stop=options.stop),
-                         VggtOptions(), Path(options.cache or '').expanduser())
-
-
-def _plan_runs(setup: TrainingSetup, options: AblationOptions, split: SequenceSplit,
-               seeds: Sequence[int], folder: Path, backbone: Backbone) -> Iterator[TrainingRun]:
-    """Yield the trainings of all rows and seeds; raises KfvoError."""
-    from kfvo_ros.training.ablation import TrainingRun, read_ablation_rows
+    setup = make_setup(options.recipe, options.stop, Path(options.cache or '').expanduser())
     recipes = read_ablation_rows(setup.recipe, options.steps)
     rows = tuple(recipes) if options.rows is None else parse_names(options.rows, 'rows', recipes)
-    for row in rows:
-        plan = replace(setup, recipe=recipes[row]).plan(split.training, split.validation,
-                                                        backbone)
-        for seed in seeds:
-            yield TrainingRun(row, replace(plan, seed=seed), folder)
-
-
-def _make_test(setup: TrainingSetup, sequences: tuple[str, ...], backbone: Backbone) -> PolicyTest:
-    """Return the test, with its sequences encoded as in use; raises KfvoError."""
-    from tqdm import tqdm
-
-    from kfvo_ros.odometry import factory
-    from kfvo_ros.training.ablation import PolicyTest
-    from kfvo_ros.training.evaluation import PolicyEvaluation
-    cache = setup.sequence_cache(backbone)
-    encoded = [cache.sequence(text) for text in tqdm(sequences, unit='sequence', desc='test')]
-    signature = factory.signature_of(setup.odometry, backbone)
-    return PolicyTest(sequences, PolicyEvaluation(encoded, backbone, signature), setup.odometry)
-
-
-def _train_and_test(run: TrainingRun, split: SequenceSplit, options: AblationOptions,
-                    test: PolicyTest) -> list[PolicyResult]:
-    """Return the results of a training, which is trained first unless it is complete."""
-    from kfvo_ros.keyframes.learned import read_policy
-    if run.is_complete():
-        print(f'{run.files.output} is complete')
-    else:
-        _train(run, split, options)
-    policy = read_policy(run.files.output).policy(test.evaluation.signature)
-    return test.results(run.row, run.seed, policy)
+    with single_threaded():
+        backbone = factory.make_backbone(setup.odometry)
+        plans = {row: replace(setup, recipe=recipes[row]).plan(split.training, split.validation,
+                                                               backbone) for row in rows}
+        runs = [TrainingRun(row, replace(plan, seed=seed), folder)
+                for row, plan in plans.items() for seed in seeds]
+        for run in runs:
+            run.prepare(options.resume)
+        test = PolicyTest.load(split.test, setup, backbone)
+        report = AblationReport(folder, list(test.reference_results(setup.recipe)))
+        for number, run in enumerate(runs, 1):
+            print(f'{number} of {len(runs)}: {run.row}, seed {run.seed}', flush=True)
+            if run.is_complete():
+                print(f'{run.files.output} is complete')
+            else:
+                _train(run, split, options)
+            report.add(test.file_results(run.row, run.seed, run.files.output),
+                       run.plan.recipe.reward, run.files.folder)
+    print(f'\n{report.table}\n{", ".join(map(str, report.files))}')
 
 
 def _train(run: TrainingRun, split: SequenceSplit, options: AblationOptions) -> None:
@@ -163,21 +115,6 @@ def _train(run: TrainingRun, split: SequenceSplit, options: AblationOptions) -> 
     if train.main(argv) != 0:
         raise KfvoError(f'{run.row}, seed {run.seed}: not trained to the end, for the reason '
                         'above; --resume goes on from there')
-
-
-def _write_report(runs: Sequence[TrainingRun], results: Sequence[PolicyResult]) -> None:
-    """Write table and curves of the trainings so far."""
-    from kfvo_ros.training.ablation_report import (
-        plot_curves,
-        read_curve,
-        write_csv,
-        write_markdown,
-    )
-    folder = runs[0].folder
-    write_csv(folder / CSV, results)
-    write_markdown(folder / MARKDOWN, results)
-    plot_curves(folder / CURVES, [
-        read_curve(run.row, run.plan.recipe.reward, run.files.folder) for run in runs])
 
 
 def _split_sequences(arguments: argparse.Namespace) -> SequenceSplit:

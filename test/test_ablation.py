@@ -23,7 +23,7 @@ from kfvo_ros import ablation
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.keyframes.learned import read_policy
 from kfvo_ros.odometry import factory
-from kfvo_ros.training.ablation import read_ablation_rows
+from kfvo_ros.training.ablation import PolicyTest, make_setup, read_ablation_rows
 from kfvo_ros.training.ablation_report import read_curve
 from kfvo_ros.training.config import read_training_config
 from kfvo_ros.training.rewards import ALPHA
@@ -105,8 +105,8 @@ def test_the_table_has_all_rows_and_the_curves_are_plotted(done):
 
 def test_the_expert_has_a_row_of_its_own(folder):
     recipe = read_training_config('train.yaml')
-    setup = ablation._make_setup(ablation.AblationOptions(stop=30, cache=str(folder / 'cache')))
-    test = ablation._make_test(setup, TESTED[:1], factory.make_backbone(setup.odometry))
+    setup = make_setup('train.yaml', 30, folder / 'cache')
+    test = PolicyTest.load(TESTED[:1], setup, factory.make_backbone(setup.odometry))
     results = list(test.reference_results(recipe))
     assert [each.row for each in results if each.row != 'random'] == [
         *REFERENCES[:3], 'teacher', *REFERENCES[4:]]

@@ -21,8 +21,8 @@ class OdometryOptions:
         None, "scale alignment between windows; default: the backbone's rule", SCALE_RULES,
         flag='scale')
     keyframes: str | None = option(
-        None, 'policy that selects the keyframes; default: learned where a policy file fits the '
-        'backbone and its options, else survival', POLICIES)
+        None, 'policy that selects the keyframes; default: learned if policy is set or the file '
+        'shipped for the backbone fits, else survival', POLICIES)
     flow_threshold: float = option(
         50.0, 'optical_flow: keep above this mean flow since the last keyframe [px]',
         least=0.0)

@@ -55,9 +55,9 @@ def make_header(stamp_ns: int, frame_id: str) -> Header:
     return Header(stamp=Time(sec=seconds, nanosec=nanoseconds), frame_id=frame_id)
 
 
-def make_odometry(stamp_ns: int, frame_id: str, child_frame_id: str, T_frame_child: np.ndarray,
-                  covariance: np.ndarray, twist: np.ndarray, twist_covariance: np.ndarray
-                  ) -> Odometry:
+def make_odometry_message(stamp_ns: int, frame_id: str, child_frame_id: str,
+                          T_frame_child: np.ndarray, covariance: np.ndarray, twist: np.ndarray,
+                          twist_covariance: np.ndarray) -> Odometry:
     """Return an Odometry: pose in `frame_id`, `twist` (6,) in the child frame, linear first.
 
     Both covariances are (6, 6): translation first, then rotation.
@@ -71,22 +71,22 @@ def make_odometry(stamp_ns: int, frame_id: str, child_frame_id: str, T_frame_chi
     return message
 
 
-def make_pose(stamp_ns: int, frame_id: str, T_frame_child: np.ndarray) -> PoseStamped:
+def make_pose_message(stamp_ns: int, frame_id: str, T_frame_child: np.ndarray) -> PoseStamped:
     """Return a PoseStamped in `frame_id`."""
     return PoseStamped(header=make_header(stamp_ns, frame_id), pose=_pose(T_frame_child))
 
 
-def make_path(frame_id: str, poses: Iterable[tuple[int, np.ndarray]]) -> Path:
+def make_path_message(frame_id: str, poses: Iterable[tuple[int, np.ndarray]]) -> Path:
     """Return a Path of (stamp_ns, T_frame_child) with the stamp of its last pose."""
-    stamped = [make_pose(stamp_ns, frame_id, pose) for stamp_ns, pose in poses]
+    stamped = [make_pose_message(stamp_ns, frame_id, pose) for stamp_ns, pose in poses]
     header = Header(frame_id=frame_id)
     if stamped:
         header.stamp = stamped[-1].header.stamp
     return Path(header=header, poses=stamped)
 
 
-def make_transform(stamp_ns: int, frame_id: str, child_frame_id: str,
-                   T_frame_child: np.ndarray) -> TransformStamped:
+def make_transform_message(stamp_ns: int, frame_id: str, child_frame_id: str,
+                           T_frame_child: np.ndarray) -> TransformStamped:
     """Return T_frame_child as a message of TF."""
     message = TransformStamped(header=make_header(stamp_ns, frame_id),
                                child_frame_id=child_frame_id)

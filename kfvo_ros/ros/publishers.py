@@ -16,7 +16,12 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from kfvo_ros.odometry.base_motion import base_motion, base_pose
 from kfvo_ros.odometry.online import OnlinePose
 from kfvo_ros.ros.frames import BaseFrame, TransformSender
-from kfvo_ros.ros.messages import make_odometry, make_path, make_pose, make_transform
+from kfvo_ros.ros.messages import (
+    make_odometry_message,
+    make_path_message,
+    make_pose_message,
+    make_transform_message,
+)
 from kfvo_ros.ros.options import NodeOptions
 
 LOG_PERIOD_S = 5.0
@@ -53,14 +58,14 @@ class Publishers:
             return
         motion = base_motion(pose, self._T_base_camera)
         child = self._base.name(camera_frame)
-        self._odometry.publish(make_odometry(
+        self._odometry.publish(make_odometry_message(
             motion.stamp_ns, self._odom_frame, child, motion.T_odom_base, motion.covariance,
             motion.twist, motion.twist_covariance))
         if pose.is_keyframe:
-            self._keyframe.publish(make_pose(motion.stamp_ns, self._odom_frame,
-                                             motion.T_odom_base))
-        self._sender.send(make_transform(motion.stamp_ns, self._odom_frame, child,
-                                         motion.T_odom_base))
+            self._keyframe.publish(make_pose_message(motion.stamp_ns, self._odom_frame,
+                                                     motion.T_odom_base))
+        self._sender.send(make_transform_message(motion.stamp_ns, self._odom_frame, child,
+                                                 motion.T_odom_base))
 
     def publish_path(self, path: Callable[[], list[tuple[int, np.ndarray]]]) -> None:
         """Send the camera's `path` as that of the base, if it is due and has subscribers."""
@@ -71,7 +76,7 @@ class Publishers:
             return
         self._path_published_s, self._path_outdated = now, False
         T_base_camera = self._T_base_camera
-        self._path.publish(make_path(self._odom_frame, (
+        self._path.publish(make_path_message(self._odom_frame, (
             (stamp_ns, base_pose(pose, T_base_camera)) for stamp_ns, pose in path())))
 
     def _look_up_camera(self, camera_frame: str) -> None:

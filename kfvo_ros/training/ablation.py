@@ -12,16 +12,23 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from tqdm import tqdm
 
+from kfvo_ros.backbones.base import Backbone
 from kfvo_ros.errors import KfvoError, reason_of
 from kfvo_ros.evaluation import metrics
 from kfvo_ros.keyframes.base import KeyframePolicy
 from kfvo_ros.keyframes.guard import NO_GUARD
 from kfvo_ros.keyframes.learned import read_policy
-from kfvo_ros.odometry.options import OdometryOptions
+from kfvo_ros.odometry import factory
+from kfvo_ros.odometry.options import OdometryOptions, SequenceOptions, VggtOptions
 from kfvo_ros.training.ablation_report import PolicyResult
 from kfvo_ros.training.checkpoint import differences, read_checkpoint
-from kfvo_ros.training.config import TrainingConfig, make_training_config
+from kfvo_ros.training.config import (
+    TrainingConfig,
+    make_training_config,
+    read_training_config,
+)
 from kfvo_ros.training.evaluation import (
     GuardOnly,
     PolicyEvaluation,
@@ -29,7 +36,7 @@ from kfvo_ros.training.evaluation import (
     ate_percent,
     reference_policies,
 )
-from kfvo_ros.training.plan import SUFFIX, TrainingFiles, TrainingPlan
+from kfvo_ros.training.plan import SUFFIX, TrainingFiles, TrainingPlan, TrainingSetup
 from kfvo_ros.utils.config import to_mapping
 from kfvo_ros.utils.files import atomic_write, find_config, read_yaml
 
@@ -38,6 +45,14 @@ MIN_VALIDATIONS = 8
 """Points of a learning curve, at least."""
 RANDOM_SEEDS = (0, 1, 2)
 """Seeds of the random policy."""
+
+
+def make_setup(recipe: str, stop: int | None, cache: Path) -> TrainingSetup:
+    """Return what the test and all trainings have in common; raises KfvoError."""
+    config = read_training_config(recipe)
+    odometry = OdometryOptions(scale_rule=config.scale)
+    return TrainingSetup(odometry.seed, config, odometry, SequenceOptions(stop=stop),
+                         VggtOptions(), cache)
 
 
 def read_ablation_rows(recipe: TrainingConfig, steps: int) -> dict[str, TrainingConfig]:
@@ -124,6 +139,19 @@ class PolicyTest:
     sequences: tuple[str, ...]
     evaluation: PolicyEvaluation
     options: OdometryOptions
+
+    @classmethod
+    def load(cls, sequences: tuple[str, ...], setup: TrainingSetup,
+             backbone: Backbone) -> PolicyTest:
+        """Return the test, with its sequences encoded as in use; raises KfvoError."""
+        cache = setup.sequence_cache(backbone)
+        encoded = [cache.sequence(text) for text in tqdm(sequences, unit='sequence', desc='test')]
+        signature = factory.signature_of(setup.odometry, backbone)
+        return cls(sequences, PolicyEvaluation(encoded, backbone, signature), setup.odometry)
+
+    def file_results(self, row: str, seed: int, policy: Path) -> list[PolicyResult]:
+        """Return the results of a policy file; raises KfvoError for one that does not fit."""
+        return self.results(row, seed, read_policy(policy).policy(self.evaluation.signature))
 
     def results(self, row: str, seed: int | None, policy: KeyframePolicy) -> list[PolicyResult]:
         """Return the results of a policy on all sequences."""

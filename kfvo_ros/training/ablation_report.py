@@ -6,14 +6,20 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.ticker import LogLocator
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from kfvo_ros.evaluation.plots import COLOURS, save_figure, style_axes
 from kfvo_ros.utils.files import atomic_write
 
+CSV, MARKDOWN, CURVES = 'ablation.csv', 'ablation.md', 'curves.png'
 FULL = 'full'
 """The row that all others are compared with."""
 TABLE_HEAD = f"""\
@@ -92,18 +98,41 @@ class LearningCurve:
     references: dict[str, float]
 
 
+@dataclass
+class AblationReport:
+    """Files in ``folder`` on the trained policies so far and, below them, the ``references``."""
+
+    folder: Path
+    references: list[PolicyResult]
+    _results: list[PolicyResult] = field(default_factory=list)
+    _curves: list[LearningCurve] = field(default_factory=list)
+
+    @property
+    def table(self) -> str:
+        """The table in Markdown."""
+        return ablation_markdown([*self._results, *self.references])
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """Paths of table, CSV and curves."""
+        return tuple(self.folder / name for name in (MARKDOWN, CSV, CURVES))
+
+    def add(self, results: Sequence[PolicyResult], reward: str, logs: Path) -> None:
+        """Add the results of a training with this reward and its logs; write all files."""
+        self._results += results
+        self._curves.append(read_curve(results[0].row, reward, logs))
+        write_csv(self.folder / CSV, [*self._results, *self.references])
+        with atomic_write(self.folder / MARKDOWN) as draft:
+            draft.write_text(self.table, encoding='utf-8')
+        plot_curves(self.folder / CURVES, self._curves)
+
+
 def write_csv(path: Path, results: Sequence[PolicyResult]) -> None:
     """Write one line per row, seed and sequence; the seed is empty where nothing is random."""
     with atomic_write(path) as draft, draft.open('w', encoding='utf-8', newline='') as file:
         writer = csv.DictWriter(file, [each.name for each in fields(PolicyResult)])
         writer.writeheader()
         writer.writerows(asdict(result) for result in results)
-
-
-def write_markdown(path: Path, results: Sequence[PolicyResult]) -> None:
-    """Write the table of the results."""
-    with atomic_write(path) as draft:
-        draft.write_text(ablation_markdown(results), encoding='utf-8')
 
 
 def ablation_markdown(results: Sequence[PolicyResult]) -> str:
@@ -134,7 +163,6 @@ def _format(row: AblationRow, verdict: str) -> str:
 
 def read_curve(row: str, reward: str, folder: Path) -> LearningCurve:
     """Read the logs of a training; of a step that was repeated the last value counts."""
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
     logs = EventAccumulator(str(folder)).Reload()
 
     def scalars(tag: str) -> np.ndarray:
@@ -152,11 +180,6 @@ def plot_curves(path: Path, curves: Sequence[LearningCurve]) -> None:
 
     Returns of different rewards are not comparable, so each reward has its own axes.
     """
-    from matplotlib.figure import Figure
-    from matplotlib.layout_engine import ConstrainedLayoutEngine
-    from matplotlib.ticker import LogLocator
-
-    from kfvo_ros.evaluation.plots import COLOURS, save_figure
     rewards = tuple(dict.fromkeys(curve.reward for curve in curves))
     rows = tuple(dict.fromkeys(curve.row for curve in curves))
     colours = {row: COLOURS[index % len(COLOURS)] for index, row in enumerate(rows)}
@@ -180,7 +203,6 @@ def plot_curves(path: Path, curves: Sequence[LearningCurve]) -> None:
 
 
 def _draw(axes: Any, colours: dict[str, str], lines: Sequence[tuple[str, np.ndarray]]) -> None:
-    from kfvo_ros.evaluation.plots import style_axes
     for row in dict.fromkeys(row for row, _ in lines):
         seeds = [values for name, values in lines if name == row and len(values)]
         for values in seeds:

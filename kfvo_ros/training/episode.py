@@ -10,7 +10,7 @@ import numpy as np
 
 from kfvo_ros import geometry
 from kfvo_ros.backbones.base import Backbone, Encoded, Estimate, Stream, Window
-from kfvo_ros.keyframes.base import DecisionInput
+from kfvo_ros.keyframes.base import POSE_SIZE, DecisionInput
 from kfvo_ros.keyframes.guard import KeyframeGuard
 from kfvo_ros.keyframes.heuristics import EveryFrame
 from kfvo_ros.odometry.keyframe_odometry import KeyframeOdometry
@@ -21,7 +21,6 @@ from kfvo_ros.training.rewards import STANDSTILL_M, Reward
 
 LOOKAHEAD = 2
 """True motions after the newest frame that the critic sees."""
-POSE_SIZE = 7
 PRIVILEGED_SIZE = (1 + LOOKAHEAD) * POSE_SIZE + 2
 
 

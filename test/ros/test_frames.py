@@ -21,7 +21,7 @@ from kfvo_ros.odometry.factory import make_odometry
 from kfvo_ros.odometry.online import OnlineOdometry, TrajectoryLog
 from kfvo_ros.odometry.options import OdometryOptions
 from kfvo_ros.ros import frames as module
-from kfvo_ros.ros.messages import make_transform, to_transform
+from kfvo_ros.ros.messages import make_transform_message, to_transform
 from kfvo_ros.ros.options import NodeOptions
 from kfvo_ros.trajectory import NANOSECONDS
 
@@ -51,7 +51,7 @@ def tf2_ros(monkeypatch) -> ModuleType:
 def make_edge(parent: str, child: str, translation: tuple[float, float, float],
               rotation: np.ndarray, seconds: int):
     """Return T_parent_child of a rotation vector as TF has it."""
-    return make_transform(seconds * NANOSECONDS, parent, child, geometry.make_transform(
+    return make_transform_message(seconds * NANOSECONDS, parent, child, geometry.make_transform(
         geometry.exp_so3(rotation), np.array(translation)))
 
 

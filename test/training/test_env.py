@@ -56,7 +56,7 @@ def episodes(sequence: EncodedSequence, backbone: GeometricBackbone,
     return (make_episode(sequence, backbone, guard) for _ in repeat(None))
 
 
-class CountingBackbone(GeometricBackbone):
+class CallRecordingBackbone(GeometricBackbone):
     """Records the number of windows of each call."""
 
     def __init__(self) -> None:
@@ -68,7 +68,7 @@ class CountingBackbone(GeometricBackbone):
         return super().estimate(windows)
 
 
-class ScriptedPolicy(KeyframePolicy):
+class RecordingPolicy(KeyframePolicy):
     """Decides by a list, and records the observations."""
 
     name = 'scripted'
@@ -83,7 +83,7 @@ class ScriptedPolicy(KeyframePolicy):
 
 def test_observations_are_those_of_a_policy_in_use(backbone, sequences):
     decisions = np.random.default_rng(0).integers(0, 2, FRAMES).astype(bool)
-    policy = ScriptedPolicy(decisions)
+    policy = RecordingPolicy(decisions)
     odometry = KeyframeOdometry(backbone, policy, 'depth')
     updates = [odometry.process(frame) for frame in SyntheticSequence(3, 'smooth', FRAMES)]
     assert all(update.status is not Status.LOST for update in updates)
@@ -106,7 +106,7 @@ def test_observations_hold_the_selected_numbers_only(backbone, sequences):
 
 
 def test_two_sequences_take_one_call_per_step(sequences):
-    backbone = CountingBackbone()
+    backbone = CallRecordingBackbone()
     environment = KeyframeEnvironment(
         backbone, [episodes(sequence, backbone) for sequence in sequences], ALL)
     environment.reset()
@@ -234,7 +234,7 @@ def test_rewards_before_the_first_decision_do_not_count(backbone, sequences):
 
 
 def test_frames_of_many_sequences_are_encoded_in_one_call(backbone, sequences):
-    class EncodingBackbone(CountingBackbone):
+    class EncodingBackbone(CallRecordingBackbone):
         def encode(self, seen):
             self.calls.append(-len(seen))
             return super().encode(seen)

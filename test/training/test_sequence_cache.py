@@ -26,30 +26,30 @@ def backbone() -> GeometricBackbone:
     return GeometricBackbone()
 
 
-class CountingBackbone(GeometricBackbone):
+class OpenCountingBackbone(GeometricBackbone):
     opened = 0
 
     def open(self, camera):
-        CountingBackbone.opened += 1
+        OpenCountingBackbone.opened += 1
         return super().open(camera)
 
 
 @pytest.fixture(autouse=True)
 def reset_count() -> None:
-    CountingBackbone.opened = 0
+    OpenCountingBackbone.opened = 0
 
 
 def test_a_sequence_is_encoded_once(tmp_path):
     for _ in range(2):
-        cache = EncodedSequenceCache(CountingBackbone(), OPTIONS, {'seed': 0}, tmp_path)
+        cache = EncodedSequenceCache(OpenCountingBackbone(), OPTIONS, {'seed': 0}, tmp_path)
         for _ in range(2):
             cache.variant(SEQUENCES[0], Augmentation(), 1)
             cache.sequence(SEQUENCES[0])
-    assert CountingBackbone.opened == 2 and len(list(tmp_path.iterdir())) == 2
+    assert OpenCountingBackbone.opened == 2 and len(list(tmp_path.iterdir())) == 2
     for options, seed in ((OPTIONS, 1), (SequenceOptions(stop=25), 0)):
-        other = EncodedSequenceCache(CountingBackbone(), options, {'seed': seed}, tmp_path)
+        other = EncodedSequenceCache(OpenCountingBackbone(), options, {'seed': seed}, tmp_path)
         other.sequence(SEQUENCES[0])
-    assert CountingBackbone.opened == 4
+    assert OpenCountingBackbone.opened == 4
 
 
 def add_a_line(path: Path) -> None:
@@ -73,15 +73,15 @@ def test_a_changed_sequence_is_encoded_again(kind, change, tmp_path):
     for expected in (1, 1, 2):
         if expected == 2:
             change(path)
-        EncodedSequenceCache(CountingBackbone(), SequenceOptions(),
+        EncodedSequenceCache(OpenCountingBackbone(), SequenceOptions(),
                              folder=tmp_path / 'cache').sequence(str(path))
-        assert CountingBackbone.opened == expected
+        assert OpenCountingBackbone.opened == expected
 
 
 def test_a_calibration_beside_a_file_changes_its_key_only(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'room.bag').write_text('a bag')
-    cache = EncodedSequenceCache(CountingBackbone(), OPTIONS)
+    cache = EncodedSequenceCache(OpenCountingBackbone(), OPTIONS)
     before = [cache._file_stem(text, None, 0) for text in ('room.bag', SEQUENCES[0])]
     write_camera_info(tmp_path, 30.0)
     after = [cache._file_stem(text, None, 0) for text in ('room.bag', SEQUENCES[0])]
@@ -94,9 +94,9 @@ def test_with_another_calibration_a_sequence_is_encoded_again(tmp_path):
     for count, focal in enumerate((30.0, 30.0, 31.0)):
         write_camera_info(tmp_path, focal)
         options = SequenceOptions(camera=str(tmp_path / 'camera_info.yaml'))
-        EncodedSequenceCache(CountingBackbone(), options,
+        EncodedSequenceCache(OpenCountingBackbone(), options,
                              folder=tmp_path / 'cache').sequence(str(path))
-        assert CountingBackbone.opened == max(count, 1)
+        assert OpenCountingBackbone.opened == max(count, 1)
 
 
 class ReferenceCycle:

@@ -92,8 +92,8 @@ def test_stdout_that_cannot_be_written_is_an_error(body):
 @pytest.mark.parametrize('sent', [signal.SIGINT, signal.SIGTERM])
 def test_signals(sent, until_stopped, tmp_path: Path):
     started = tmp_path / 'started'
-    # The sleeps are short, since a signal just before a sleep is handled after it. There is no file
-    # object, since a signal that arrives while one is freed is lost.
+    # The sleeps are short, since a signal just before a sleep is handled after it. No file is
+    # opened, since a signal that arrives while a file object is freed is lost.
     body = (f'os.close(os.open({str(started)!r}, os.O_CREAT)); '
             '[time.sleep(0.05) for _ in range(1200)]')
     status, output, problems = run_interrupted(sent, started.exists,
