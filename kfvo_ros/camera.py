@@ -1,28 +1,40 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Camera intrinsics and distortion, and their ROS calibration file."""
+"""Camera intrinsics and distortion."""
 
 from __future__ import annotations
 
+import functools
 import math
+import re
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
-import yaml
 
-from kfvo_ros.errors import KfvoError, reason_of
-from kfvo_ros.utils.files import read_yaml
+from kfvo_ros.errors import KfvoError
 
-DISTORTION_SIZES = {'none': (0,), 'plumb_bob': (4, 5), 'rational_polynomial': (8,),
-                    'equidistant': (4,)}
+PLUMB_BOB, RATIONAL = 'plumb_bob', 'rational_polynomial'
+"""OpenCV's polynomial models; the number of coefficients tells which of them it is."""
+DISTORTION_SIZES = {'none': (0,), PLUMB_BOB: (4, 5), RATIONAL: (8, 12, 14), 'equidistant': (4,)}
 """Distortion models by ROS name, with their possible numbers of coefficients."""
-MODEL_SYNONYMS = {'': 'none', 'none': 'none', 'pinhole': 'none', 'plumb_bob': 'plumb_bob',
-                  'radtan': 'plumb_bob', 'radial-tangential': 'plumb_bob',
-                  'rational_polynomial': 'rational_polynomial', 'equidistant': 'equidistant',
-                  'fisheye': 'equidistant'}
+POLYNOMIAL_SIZES = (*DISTORTION_SIZES[PLUMB_BOB], *DISTORTION_SIZES[RATIONAL])
+MODEL_SYNONYMS = {
+    'none': 'none', 'pinhole': 'none', 'plumbbob': PLUMB_BOB, 'radtan': PLUMB_BOB,
+    'radialtangential': PLUMB_BOB, 'opencv': PLUMB_BOB, 'brownconrady': PLUMB_BOB,
+    'modifiedbrownconrady': PLUMB_BOB, 'inversebrownconrady': PLUMB_BOB, 'rational': RATIONAL,
+    'rationalpolynomial': RATIONAL, 'thinprism': RATIONAL, 'equidistant': 'equidistant',
+    'equi': 'equidistant', 'fisheye': 'equidistant', 'opencvfisheye': 'equidistant',
+    'kannalabrandt': 'equidistant', 'kannalabrandt4': 'equidistant'}
+"""Names of the models, as `plain_name` writes them."""
+FOCAL_RANGE = (0.05, 1000.0)
+"""Plausible focal lengths in units of the image's longer side."""
+MAX_PIXEL_ASPECT = 4.0
+"""Largest ratio of fx and fy: pixels may be binned in one direction."""
+MAX_CENTRE_OFFSET = 2.0
+"""How far the principal point may lie outside of the image, in focal lengths."""
+MAX_SHIFT = 2.0
+"""Largest shift by distortion, relative to the distance from the axis, halfway to the edge."""
 NEWTON_STEPS = 15
 """Moderate distortion converges in three steps, the corners of a wide-angle image in eight."""
 CONVERGED = 1e-7
@@ -55,18 +67,8 @@ class Camera:
     readout_s: float = 0.0
 
     def __post_init__(self) -> None:
-        model = MODEL_SYNONYMS.get(self.distortion_model.strip().lower())
-        if model is None:
-            raise KfvoError(f'unknown distortion model {self.distortion_model!r}; expected one '
-                            f'of {", ".join(sorted(DISTORTION_SIZES))}')
-        coefficients = tuple(float(value) for value in self.distortion)
-        if model != 'equidistant' and not any(coefficients):
-            model, coefficients = 'none', ()
-        if model == 'plumb_bob' and len(coefficients) == 4:
-            coefficients += (0.0,)  # ROS always stores a k3
-        if len(coefficients) not in DISTORTION_SIZES[model]:
-            raise KfvoError(f'{model} takes {DISTORTION_SIZES[model]} distortion coefficients, '
-                            f'{len(coefficients)} came')
+        model, coefficients = _distortion(self.distortion_model,
+                                          tuple(float(value) for value in self.distortion))
         numbers = {'fx': self.fx, 'fy': self.fy, 'cx': self.cx, 'cy': self.cy} | {
             f'distortion[{index}]': value for index, value in enumerate(coefficients)}
         bad = [f'{name}={value}' for name, value in numbers.items() if not math.isfinite(value)]
@@ -80,6 +82,37 @@ class Camera:
                             f'readout_s={self.readout_s}')
         object.__setattr__(self, 'distortion_model', model)
         object.__setattr__(self, 'distortion', coefficients)
+        self._check_matrix()
+        self._check_distortion()
+
+    def _check_matrix(self) -> None:
+        """Raise KfvoError for numbers that no camera has, such as those of a misplaced matrix."""
+        side = max(self.width, self.height)
+        least, most = (share * side for share in FOCAL_RANGE)
+        if not (least <= self.fx <= most and least <= self.fy <= most
+                and 1.0 / MAX_PIXEL_ASPECT <= self.fx / self.fy <= MAX_PIXEL_ASPECT):
+            raise KfvoError(f'expected focal lengths of {least:.6g} to {most:.6g} px for '
+                            f'{self.width}x{self.height} images, and fx like fy; came '
+                            f'fx={self.fx} fy={self.fy}; is it calibrated, in pixels?')
+        for centre, size, focal in ((self.cx, self.width, self.fx),
+                                    (self.cy, self.height, self.fy)):
+            reach = MAX_CENTRE_OFFSET * focal
+            if not -reach <= centre <= size + reach:
+                raise KfvoError(f'expected a principal point in or near the {self.width}x'
+                                f'{self.height} image, came cx={self.cx} cy={self.cy}; is it '
+                                'calibrated?')
+
+    def _check_distortion(self) -> None:
+        """Raise KfvoError for coefficients that no lens has, some of which have no inverse."""
+        if self.distortion_model == 'none':
+            return
+        radius = 0.25 * max(self.width, self.height) / max(self.fx, self.fy)
+        shift = _largest_shift(self.distortion_model, self.distortion, radius)
+        if not shift <= MAX_SHIFT:  # NaN neither
+            raise KfvoError('expected the distortion of a lens, came '
+                            f'{self.distortion_model} {list(self.distortion)}, which shifts '
+                            f'pixels by {shift:.3g} times their distance from the axis; is it '
+                            'calibrated?')
 
     @property
     def matrix(self) -> np.ndarray:
@@ -146,12 +179,7 @@ class Camera:
         points = np.asarray(points, dtype=np.float64).reshape(-1, 2)
         if self.distortion_model == 'none' or len(points) == 0:
             return points * (self.fx, self.fy) + (self.cx, self.cy)
-        coefficients = np.array(self.distortion)
-        if self.distortion_model == 'equidistant':
-            return cv2.fisheye.distortPoints(points[:, None], self.matrix, coefficients)[:, 0]
-        rays = np.column_stack([points, np.ones(len(points))])
-        zero = np.zeros(3)
-        return cv2.projectPoints(rays, zero, zero, self.matrix, coefficients)[0][:, 0]
+        return _project(points, self.matrix, self.distortion_model, self.distortion)
 
     def scaled(self, width: int, height: int) -> Camera:
         """Return the camera of the image resized to width x height.
@@ -199,48 +227,61 @@ def guess_camera(width: int, height: int) -> Camera:
                   guessed=True)
 
 
-def read_camera_info(path: Path) -> Camera:
-    """Read a calibration file in the format of ROS' camera_calibration.
+def _project(points: np.ndarray, K: np.ndarray, model: str, distortion: tuple[float, ...]
+             ) -> np.ndarray:
+    """Return the pixels (N, 2) of normalised coordinates (N, 2) by one of the models."""
+    coefficients = np.array(distortion)
+    if model == 'equidistant':
+        return cv2.fisheye.distortPoints(points[:, None], K, coefficients)[:, 0]
+    rays = np.column_stack([points, np.ones(len(points))])
+    zero = np.zeros(3)
+    return cv2.projectPoints(rays, zero, zero, K, coefficients)[0][:, 0]
 
-    The optional extra key ``readout_s`` is the readout time of a rolling shutter [s]. Raises
-    KfvoError naming the file and the key that is missing or wrong.
+
+@functools.lru_cache(maxsize=64)  # a camera is made for each message with the calibration
+def _largest_shift(model: str, distortion: tuple[float, ...], radius: float) -> float:
+    """Return the largest shift by distortion at a radius from the axis, in units of it."""
+    rays = radius * np.array([(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)])
+    with np.errstate(all='ignore'):
+        shifts = _project(rays, np.eye(3), model, distortion) - rays
+        return float(np.linalg.norm(shifts, axis=1).max()) / radius
+
+
+def plain_name(name: str) -> str:
+    """Return a name of a calibration without case, spaces, dashes and underscores."""
+    return re.sub(r'[\s_-]', '', name.lower())
+
+
+def _distortion(name: str, coefficients: tuple[float, ...]) -> tuple[str, tuple[float, ...]]:
+    """Return the ROS name of a model and as many coefficients as it has; raises KfvoError.
+
+    Without a name it is plumb_bob, as in ROS. Surplus zeros are left out.
     """
-    document = read_yaml(path, 'the calibration ')
-    try:
-        fx, _, cx, _, fy, cy = _matrix(document, 'camera_matrix', 9)[:6]
-        return Camera(int(document['image_width']), int(document['image_height']), fx, fy, cx,
-                      cy, str(document.get('distortion_model', 'none')),
-                      _matrix(document, 'distortion_coefficients', None),
-                      readout_s=float(document.get('readout_s', 0.0)))
-    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        raise KfvoError(f'{path}: expected a ROS camera calibration with image_width, '
-                        f'image_height, camera_matrix, distortion_model and '
-                        f'distortion_coefficients; problem: {error!r}') from error
-    except KfvoError as error:
-        raise KfvoError(f'{path}: {error}') from error
+    plain = plain_name(name)
+    model = MODEL_SYNONYMS.get(plain) if plain else PLUMB_BOB
+    if model is None:
+        raise KfvoError(f'unknown distortion model {name!r}; expected one of '
+                        f'{", ".join(sorted(DISTORTION_SIZES))}')
+    if not coefficients or (model != 'equidistant' and not any(coefficients)):
+        return 'none', ()
+    sizes = DISTORTION_SIZES[model]
+    used = _without_zeros(coefficients, sizes)
+    if used is None and model in (PLUMB_BOB, RATIONAL):
+        sizes = POLYNOMIAL_SIZES
+        used = _without_zeros(coefficients, sizes)
+    if used is None:
+        raise KfvoError(f'{model} takes {" or ".join(map(str, sizes))} distortion coefficients, '
+                        f'{len(coefficients)} came')
+    if model == 'equidistant':
+        return model, used
+    if len(used) == 4:
+        used += (0.0,)  # ROS always stores a k3
+    return PLUMB_BOB if len(used) == 5 else RATIONAL, used
 
 
-def write_camera_info(path: Path, camera: Camera) -> None:
-    """Write a calibration file for `read_camera_info`; raises KfvoError naming the file."""
-    model, coefficients = camera.ros_distortion
-    matrices = {'camera_matrix': camera.matrix, 'rectification_matrix': np.eye(3),
-                'projection_matrix': camera.projection,
-                'distortion_coefficients': np.array([coefficients])}
-    document = {'image_width': camera.width, 'image_height': camera.height,
-                'camera_name': 'camera', 'distortion_model': model,
-                'readout_s': camera.readout_s,
-                **{key: {'rows': matrix.shape[0], 'cols': matrix.shape[1],
-                         'data': matrix.ravel().tolist()} for key, matrix in matrices.items()}}
-    text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None)
-    try:
-        path.write_text(text, encoding='utf-8')
-    except OSError as error:
-        raise KfvoError(f'cannot write the calibration {path}: {reason_of(error)}') from error
-
-
-def _matrix(document: dict[str, Any], key: str, size: int | None) -> tuple[float, ...]:
-    """Return the numbers under ``key: {data: [...]}``."""
-    data = tuple(float(value) for value in document[key]['data'])
-    if size is not None and len(data) != size:
-        raise ValueError(f'{key} holds {len(data)} numbers, expected {size}')
-    return data
+def _without_zeros(coefficients: tuple[float, ...], sizes: tuple[int, ...]
+                   ) -> tuple[float, ...] | None:
+    """Return the coefficients without as many zeros at the end as leave one of the `sizes`."""
+    while coefficients and len(coefficients) not in sizes and coefficients[-1] == 0.0:
+        coefficients = coefficients[:-1]
+    return coefficients if len(coefficients) in sizes else None

@@ -1,15 +1,16 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Distortion models against their formulas and inverses, and calibration files."""
+"""Distortion models against their formulas and inverses, and what no camera is."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from kfvo_ros.camera import Camera, guess_camera, read_camera_info
+from kfvo_ros.camera import Camera, guess_camera
 from kfvo_ros.errors import KfvoError
 
 EUROC = Camera(752, 480, 458.654, 457.296, 367.215, 248.375, 'radtan',
@@ -18,12 +19,14 @@ FREIBURG1 = Camera(640, 480, 517.306408, 516.469215, 318.643040, 255.313989, 'pl
                    (0.262383, -0.953104, -0.005358, 0.002628, 1.163314))
 RATIONAL = Camera(640, 480, 400.0, 401.0, 320.0, 240.0, 'rational_polynomial',
                   (0.5, 0.1, 1e-3, -5e-4, 0.02, 0.8, 0.2, 0.03))
+THIN_PRISM = replace(RATIONAL, distortion=(*RATIONAL.distortion, 1e-3, -2e-3, 3e-3, 1e-3))
+TILTED = replace(RATIONAL, distortion=(*THIN_PRISM.distortion, 0.02, -0.03))
 WIDE = Camera(640, 480, 300.0, 301.0, 318.0, 255.0, 'plumb_bob', (-0.4, 0.1, 1e-3, -1e-3))
 FISHEYE = Camera(1280, 1024, 470.0, 471.0, 641.0, 511.0, 'equidistant',
                  (0.01, -0.005, 0.002, -0.0005))
 PINHOLE = Camera(640, 480, 500.0, 501.0, 320.0, 240.0)
-CAMERAS = {'euroc': EUROC, 'freiburg1': FREIBURG1, 'rational': RATIONAL, 'wide': WIDE,
-           'fisheye': FISHEYE, 'pinhole': PINHOLE}
+CAMERAS = {'euroc': EUROC, 'freiburg1': FREIBURG1, 'rational': RATIONAL,
+           'thin_prism': THIN_PRISM, 'wide': WIDE, 'fisheye': FISHEYE, 'pinhole': PINHOLE}
 
 every_camera = pytest.mark.parametrize('camera', CAMERAS.values(), ids=CAMERAS)
 
@@ -52,11 +55,13 @@ def project_by_formula(camera: Camera, points: np.ndarray) -> np.ndarray:
         factor = np.where(radius > 0, distorted / np.where(radius > 0, radius, 1), 1.0)
         x, y = factor * x, factor * y
     elif camera.distortion:
-        k1, k2, p1, p2, k3, k4, k5, k6 = (*camera.distortion, *[0.0] * 8)[:8]
+        k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = (*camera.distortion, *[0.0] * 12)[:12]
         factor = ((1 + radius2 * (k1 + radius2 * (k2 + radius2 * k3)))
                   / (1 + radius2 * (k4 + radius2 * (k5 + radius2 * k6))))
-        x, y = (factor * x + 2 * p1 * x * y + p2 * (radius2 + 2 * x * x),
-                factor * y + p1 * (radius2 + 2 * y * y) + 2 * p2 * x * y)
+        x, y = (factor * x + 2 * p1 * x * y + p2 * (radius2 + 2 * x * x)
+                + radius2 * (s1 + radius2 * s2),
+                factor * y + p1 * (radius2 + 2 * y * y) + 2 * p2 * x * y
+                + radius2 * (s3 + radius2 * s4))
     return np.column_stack([camera.fx * x + camera.cx, camera.fy * y + camera.cy])
 
 
@@ -126,6 +131,13 @@ def test_non_finite_pixels_give_nan_and_no_error(camera):
     assert camera.distort(np.zeros((0, 2))).shape == (0, 2)
 
 
+def test_a_tilted_sensor_reads_back():
+    pixels = pixel_grid(TILTED)
+    rays = TILTED.undistort(pixels)
+    np.testing.assert_allclose(TILTED.distort(rays), pixels, rtol=0, atol=1e-6)
+    assert np.linalg.norm(rays - THIN_PRISM.undistort(pixels), axis=1).max() > 1e-3
+
+
 def test_matrix_projects_points_of_a_pinhole_camera():
     x, y, w = PINHOLE.matrix @ [0.2, -0.1, 2.0]
     np.testing.assert_allclose([[x / w, y / w]], PINHOLE.distort(np.array([[0.1, -0.05]])))
@@ -138,7 +150,11 @@ def test_matrix_projects_points_of_a_pinhole_camera():
     ('plumb_bob', 5, 'plumb_bob'), ('radtan', 5, 'plumb_bob'),
     ('radial-tangential', 5, 'plumb_bob'), (' Plumb_Bob ', 5, 'plumb_bob'),
     ('rational_polynomial', 8, 'rational_polynomial'), ('equidistant', 4, 'equidistant'),
-    ('fisheye', 4, 'equidistant'), ('pinhole', 0, 'none'), ('none', 0, 'none'), ('', 0, 'none')])
+    ('fisheye', 4, 'equidistant'), ('pinhole', 0, 'none'), ('none', 0, 'none'), ('', 0, 'none'),
+    ('', 5, 'plumb_bob'), ('', 8, 'rational_polynomial'), ('plumb_bob', 8, 'rational_polynomial'),
+    ('plumb_bob', 12, 'rational_polynomial'), ('rational_polynomial', 14, 'rational_polynomial'),
+    ('rational_polynomial', 5, 'plumb_bob'), ('Brown Conrady', 5, 'plumb_bob'),
+    ('Kannala Brandt4', 4, 'equidistant'), ('equidistant', 0, 'none')])
 def test_models_have_synonyms(name, count, model):
     camera = Camera(4, 4, 1.0, 1.0, 2.0, 2.0, name, (0.1,) * count)
     assert (camera.distortion_model, len(camera.distortion)) == (model, count)
@@ -147,6 +163,17 @@ def test_models_have_synonyms(name, count, model):
 def test_plumb_bob_always_has_a_k3():
     four = Camera(4, 4, 1.0, 1.0, 2.0, 2.0, 'radtan', (0.1, 0.2, 0.3, 0.4))
     assert four == Camera(4, 4, 1.0, 1.0, 2.0, 2.0, 'plumb_bob', (0.1, 0.2, 0.3, 0.4, 0.0))
+
+
+@pytest.mark.parametrize(('model', 'used', 'zeros'), [
+    ('plumb_bob', 5, 3), ('plumb_bob', 4, 8), ('equidistant', 4, 1), ('equidistant', 4, 10),
+    ('rational_polynomial', 8, 1), ('rational_polynomial', 12, 1)])
+def test_surplus_zeros_are_left_out(model, used, zeros):
+    coefficients = tuple(0.1 / (index + 1) for index in range(used))
+    expected = Camera(640, 480, 500.0, 500.0, 320.0, 240.0, model, coefficients)
+    assert Camera(640, 480, 500.0, 500.0, 320.0, 240.0, model,
+                  coefficients + (0.0,) * zeros) == expected
+    assert expected.distortion[:used] == coefficients
 
 
 def test_zero_coefficients_mean_no_distortion():
@@ -165,13 +192,34 @@ def test_zero_coefficients_mean_no_distortion():
     ({'fx': 0.0}, 'fx=0.0'), ({'fy': -5.0}, 'fy=-5.0'), ({'fx': math.nan}, 'fx=nan'),
     ({'cx': math.inf}, 'expected'), ({'distortion': (math.nan,) * 4}, 'expected'),
     ({'readout_s': 30.0}, 'readout_s=30.0'), ({'readout_s': math.nan}, 'readout_s=nan'),
-    ({'width': 0}, 'came 0x480'), ({'height': -1}, 'came 640x-1')])
+    ({'width': 0}, 'came 0x480'), ({'height': -1}, 'came 640x-1'),
+    ({'fx': 772.57, 'fy': 1.0}, r'fx like fy; came fx=772\.57 fy=1\.0; is it calibrated'),
+    ({'fx': 500.0, 'fy': 2001.0}, r'came fx=500\.0 fy=2001\.0'),
+    ({'fx': 1e300, 'fy': 1e300}, r'32 to 640000 px .*came fx=1e\+300 fy=1e\+300'),
+    ({'fx': 1e-300, 'fy': 1e-300}, 'came fx=1e-300 fy=1e-300'),
+    ({'fx': 0.8, 'fy': 0.8}, 'is it calibrated, in pixels'),
+    ({'cx': 1e30}, r'principal point in or near the 640x480 image, came cx=1e\+30 cy=240\.0'),
+    ({'cy': -1001.0}, 'came cx=320.0 cy=-1001.0'),
+    ({'distortion': (0.1,) * 6}, '4 or 5 or 8 or 12 or 14 distortion coefficients, 6 came'),
+    ({'distortion': (1e300, 0.0, 0.0, 0.0)}, r'distortion of a lens, came plumb_bob \[1e\+300'),
+    ({'distortion': (99.0, 0.0, 0.0, 0.0)}, 'shifts pixels by 10.1 times their distance'),
+    ({'distortion': (0.0, 0.0, 0.0, 1e3)}, 'distortion of a lens'),
+    ({'distortion_model': 'equidistant', 'distortion': (0.0, 0.0, 1e200, 0.0)}, 'of a lens')])
 def test_invalid_cameras_are_refused(change, message):
     values = {'width': 640, 'height': 480, 'fx': 500.0, 'fy': 500.0, 'cx': 320.0, 'cy': 240.0,
               'distortion_model': 'plumb_bob', 'distortion': (0.1, 0.0, 0.0, 0.0)}
     Camera(**values)
     with pytest.raises(KfvoError, match=message):
         Camera(**{**values, **change})
+
+
+@pytest.mark.parametrize('values', [
+    {'fx': 640.0 / 4.2, 'fy': 640.0 / 4.2},  # an equidistant lens of 240 degrees
+    {'fx': 40000.0, 'fy': 40000.0}, {'fx': 500.0, 'fy': 1000.0},
+    {'cx': -900.0, 'cy': 1400.0}])  # a region beside the axis of the lens
+def test_unusual_cameras_are_taken(values):
+    Camera(**{'width': 640, 'height': 480, 'fx': 500.0, 'fy': 500.0, 'cx': 320.0, 'cy': 240.0}
+           | values)
 
 
 def test_guess_has_a_field_of_view_of_sixty_degrees():
@@ -203,77 +251,3 @@ def test_scaled_refuses_another_aspect_ratio():
         kitti.scaled(1241, 370)
     with pytest.raises(KfvoError):
         kitti.scaled(0, 0)
-
-
-# Calibration files
-
-
-CALIBRATION = """
-image_width: 640
-image_height: 480
-camera_name: head
-camera_matrix: {rows: 3, cols: 3, data: [517.3, 0.0, 318.6, 0, 516.5, 255.3, 0, 0, 1]}
-distortion_model: plumb_bob
-distortion_coefficients: {rows: 1, cols: 5, data: [0.26, -0.95, -0.005, 0.0026, 1.16]}
-rectification_matrix: {rows: 3, cols: 3, data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}
-"""
-
-
-def test_a_calibration_is_read(tmp_path):
-    path = tmp_path / 'camera_info.yaml'
-    path.write_text(CALIBRATION)
-    assert read_camera_info(path) == Camera(640, 480, 517.3, 516.5, 318.6, 255.3, 'plumb_bob',
-                                            (0.26, -0.95, -0.005, 0.0026, 1.16))
-    path.write_text(CALIBRATION + 'readout_s: 0.03\n')
-    assert read_camera_info(path).readout_s == 0.03
-
-
-@pytest.mark.parametrize('old, new, message', [
-    ('image_width: 640', '', "KeyError\\('image_width'\\)"),
-    ('image_width: 640', 'image_width: wide', 'image_width'),
-    ('image_width: 640', 'image_width: .inf', 'image_width'),
-    ('image_height: 480', 'image_height: 0', 'came 640x0'),
-    ('camera_matrix', 'camera_matrices', "KeyError\\('camera_matrix'\\)"),
-    ('0, 0, 1]}\ndist', '0, 0]}\ndist', 'camera_matrix holds 8 numbers, expected 9'),
-    ('[517.3, ', '[0.0, ', 'is it calibrated'),
-    ('517.3', 'nan', 'expected finite numbers, came fx=nan; is it calibrated'),
-    ('318.6', '.inf', 'expected finite numbers, came cx=inf; is it calibrated'),
-    ('-0.95', '.nan', r'expected finite numbers, came distortion\[1\]=nan; is it calibrated'),
-    ('plumb_bob', 'wobbly', "unknown distortion model 'wobbly'"),
-    ('1.16', '1.16, 1, 2', 'distortion coefficients, 7 came'),
-    ('image_width: 640', 'image_width: 640\nreadout_s: 30', 'readout_s=30.0'),
-    ('distortion_coefficients', 'd', "KeyError\\('distortion_coefficients'\\)"),
-    ('{rows: 1, cols: 5, data: [0.26,', '[[0.26,', 'cannot read the calibration'),
-    ('image_width: 640', '!!python/object/apply:os.getcwd []', 'cannot read the calibration'),
-    ('image_width: 640', 'image_width: ' + '[' * 5000, 'cannot read the calibration'),
-    ('640', '2001-13-45', 'cannot read the calibration .*month'),
-    ('640', '!!int foo', "cannot read the calibration .*'foo'"),
-    ('640', '!!float x', "cannot read the calibration .*'x'"),
-    ('640', '0x_', 'cannot read the calibration .*base 16'),
-    ('640', '!!bool x', 'cannot read the calibration'),
-    ('640', '!!int ""', 'cannot read the calibration'),
-    ('640', '!!timestamp x', 'cannot read the calibration')])
-def test_the_error_names_a_bad_calibration(tmp_path, old, new, message):
-    assert old in CALIBRATION
-    path = tmp_path / 'camera_info.yaml'
-    path.write_text(CALIBRATION.replace(old, new, 1))
-    with pytest.raises(KfvoError, match=message) as caught:
-        read_camera_info(path)
-    assert str(path) in str(caught.value)
-    assert '\n' not in str(caught.value)
-
-
-@pytest.mark.parametrize('text', ['', 'just words', '- a\n- list', '5', '\x00'])
-def test_a_file_without_a_calibration_is_refused(tmp_path, text):
-    path = tmp_path / 'camera_info.yaml'
-    path.write_text(text)
-    with pytest.raises(KfvoError, match='camera_info.yaml'):
-        read_camera_info(path)
-
-
-def test_the_error_names_an_unreadable_calibration(tmp_path):
-    with pytest.raises(KfvoError, match='cannot read the calibration .*missing.yaml'):
-        read_camera_info(tmp_path / 'missing.yaml')
-    (tmp_path / 'image.yaml').write_bytes(b'\x89PNG\xff\xfe')
-    with pytest.raises(KfvoError, match='cannot read the calibration .*image.yaml'):
-        read_camera_info(tmp_path / 'image.yaml')

@@ -4,6 +4,10 @@
 
 from __future__ import annotations
 
+import os
+import struct
+import tracemalloc
+import zlib
 from array import array
 
 import cv2
@@ -11,16 +15,29 @@ import numpy as np
 import pytest
 
 from kfvo_ros.errors import KfvoError
-from kfvo_ros.images import LAYOUTS, decode_compressed, decode_image, read_image, to_grey
+from kfvo_ros.images import (
+    LAYOUTS,
+    MAX_PIXELS,
+    PLANAR,
+    decode_compressed,
+    decode_image,
+    read_image,
+    to_grey,
+)
 
 RGB = np.random.default_rng(0).integers(0, 256, (6, 8, 3), dtype=np.uint8)
 GREY = RGB[..., 0]
 ALPHA = np.full((6, 8, 1), 77, dtype=np.uint8)
 BGR = RGB[..., ::-1]
-PLAIN = {'mono8': (GREY, GREY), '8UC1': (GREY, GREY), 'rgb8': (RGB, RGB), 'bgr8': (BGR, RGB),
-         '8UC3': (BGR, RGB), 'rgba8': (np.dstack([RGB, ALPHA]), RGB),
-         'bgra8': (np.dstack([BGR, ALPHA]), RGB)}
-DEEP = {'mono16': (GREY, GREY), '16UC1': (GREY, GREY), 'rgb16': (RGB, RGB), 'bgr16': (BGR, RGB)}
+RGBA, BGRA = np.dstack([RGB, ALPHA]), np.dstack([BGR, ALPHA])
+PLAIN = {'mono8': (GREY, GREY), '8UC1': (GREY, GREY), '8UC': (GREY, GREY), 'rgb8': (RGB, RGB),
+         'bgr8': (BGR, RGB), '8UC3': (BGR, RGB), 'rgba8': (RGBA, RGB), 'bgra8': (BGRA, RGB),
+         '8UC4': (BGRA, RGB), '8UC2': (np.dstack([GREY, ALPHA]), GREY)}
+DEEP = {'mono16': (GREY, GREY), '16UC1': (GREY, GREY), '16UC': (GREY, GREY), 'rgb16': (RGB, RGB),
+        'bgr16': (BGR, RGB), '16UC3': (BGR, RGB), 'rgba16': (RGBA, RGB), 'bgra16': (BGRA, RGB),
+        '16UC4': (BGRA, RGB)}
+FLOATS = {'32FC1': (GREY, GREY), '32FC': (GREY, GREY), '32FC3': (BGR, RGB), '32FC4': (BGRA, RGB)}
+YUV = {'uyvy': 'uyvy', 'yuv422': 'uyvy', 'yuyv': 'yuyv', 'yuv422_yuy2': 'yuyv'}
 PATTERNS = {'rggb': ((0, 1), (1, 2)), 'bggr': ((2, 1), (1, 0)),
             'gbrg': ((1, 2), (0, 1)), 'grbg': ((1, 0), (2, 1))}
 
@@ -64,7 +81,59 @@ def test_bayer(pattern, bits):
     np.testing.assert_array_equal(image, np.broadcast_to(colour, (16, 16, 3)))
 
 
-@pytest.mark.parametrize(('encoding', 'order'), [('yuv422', 'uyvy'), ('yuv422_yuy2', 'yuyv')])
+@pytest.mark.parametrize('padding', [0, 3])
+@pytest.mark.parametrize('is_bigendian', [False, True])
+@pytest.mark.parametrize('encoding', FLOATS)
+def test_floats_are_brightness_from_zero_to_one(encoding, is_bigendian, padding):
+    stored, expected = FLOATS[encoding]
+    step, data = pack((stored / 255.0).astype('>f4' if is_bigendian else '<f4'), padding)
+    np.testing.assert_array_equal(decode_image(encoding, 6, 8, step, is_bigendian, data), expected)
+
+
+@pytest.mark.parametrize(('value', 'message'), [
+    (7.5, r'brightness of 0 to 1 in a 32FC1 image, came values of 0\.5 to 7\.5; is it depth'),
+    (-0.5, 'came values of -0.5 to 0.5'), (np.nan, 'came values of nan to nan')])
+def test_other_floats_are_refused(value, message):
+    with pytest.raises(KfvoError, match=message):
+        decode_image('32FC1', 1, 2, 8, False, np.array([value, 0.5], '<f4').tobytes())
+
+
+def red(count: int) -> tuple[list[int], list[int]]:
+    """Return Y, and U and V in turn, of this number of red pixels by BT.601."""
+    return [81] * count, [90, 240] * count
+
+
+@pytest.mark.parametrize('padding', [0, 4])
+@pytest.mark.parametrize('encoding', PLANAR)
+def test_planar_yuv(encoding, padding):
+    brightness, colour = red(8)
+    if encoding == 'nv24':
+        chroma = [colour + [0] * 2 * padding] * 6
+    else:
+        chroma = [colour[:8][::-1 if encoding == 'nv21' else 1] + [0] * padding] * 3
+    rows = [brightness + [0] * padding] * 6 + chroma
+    data = np.array([value for row in rows for value in row], np.uint8)
+    image = decode_image(encoding, 6, 8, 8 + padding, False, data)
+    assert image.shape == (6, 8, 3)
+    assert np.abs(image.astype(int) - (255, 0, 0)).max() <= 2
+    # Some drivers count the bytes of both planes in their step.
+    np.testing.assert_array_equal(decode_image(encoding, 6, 8, data.size // 6, False, data), image)
+
+
+def test_planes_of_other_sizes_are_refused():
+    for encoding, height, width, size in (
+            ('nv21', 6, 8, 71), ('nv21', 6, 8, 48), ('nv12', 6, 8, 0), ('nv12', 5, 8, 60),
+            ('nv24', 6, 7, 126), ('nv24', 6, 8, 96), ('nv21', 0, 8, 0)):
+        with pytest.raises(KfvoError, match=f'expected a {encoding} image of even size'):
+            decode_image(encoding, height, width, width, False, bytes(size))
+
+
+def test_a_step_that_is_too_small_is_corrected():
+    np.testing.assert_array_equal(decode_image('rgb8', 6, 8, 8, False, RGB.tobytes()), RGB)
+    np.testing.assert_array_equal(decode_image('mono8', 6, 8, 0, False, GREY.tobytes()), GREY)
+
+
+@pytest.mark.parametrize(('encoding', 'order'), YUV.items())
 def test_yuv(encoding, order):
     """BT.601 red: Y 81, U 90, V 240."""
     values = {'y': 81, 'u': 90, 'v': 240}
@@ -94,7 +163,8 @@ def test_the_image_owns_its_memory(container):
 
 
 @pytest.mark.parametrize(('encoding', 'height', 'width', 'step', 'size', 'message'), [
-    ('32FC1', 2, 2, 8, 16, 'unknown image encoding.*32FC1.*mono8'),
+    ('64FC1', 2, 2, 16, 32, 'unknown image encoding.*64FC1.*mono8.*nv24'),
+    ('16SC1', 2, 2, 4, 8, 'unknown image encoding.*16SC1'),
     ('rgb8', 2, 2, 5, 10, 'step >= 6'),
     ('mono8', 2, 2, 2, 3, 'step 2 and 3 bytes'),
     ('mono8', 2, 2, 2, 5, 'step 2 and 5 bytes'),
@@ -109,8 +179,8 @@ def test_inconsistent_sizes_are_refused(encoding, height, width, step, size, mes
 
 def test_every_layout_is_tested():
     bayer = {f'bayer_{pattern}{bits}' for pattern in PATTERNS for bits in (8, 16)}
-    named = {name.lower() for name in (*PLAIN, *DEEP)}
-    assert named | bayer | {'yuv422', 'yuv422_yuy2'} == set(LAYOUTS)
+    named = {name.lower() for name in (*PLAIN, *DEEP, *FLOATS, *YUV)}
+    assert named | bayer == set(LAYOUTS)
 
 
 def png(pixels: np.ndarray) -> bytes:
@@ -150,6 +220,51 @@ def test_bytes_that_are_no_image_are_refused():
     for data in (b'', b'no picture at all', png(GREY)[:20], floats):
         with pytest.raises(KfvoError, match='expected a JPEG, PNG'):
             decode_compressed(data, 'png')
+
+
+def test_grey_with_alpha_is_grey():
+    rows = b''.join(b'\0' + bytes(value for grey in row for value in (grey, 255)) for row in GREY)
+    data = png_of(8, 6, zlib.compress(rows), colour_type=4)
+    np.testing.assert_array_equal(to_grey(decode_compressed(data)), GREY)
+
+
+def png_of(width: int, height: int, pixels: bytes, colour_type: int = 0) -> bytes:
+    """Return a PNG of 8 bits with this header and these compressed rows."""
+    chunks = ((b'IHDR', struct.pack('>IIBBBBB', width, height, 8, colour_type, 0, 0, 0)),
+              (b'IDAT', pixels), (b'IEND', b''))
+    return b'\x89PNG\r\n\x1a\n' + b''.join(
+        struct.pack('>I', len(content)) + kind + content
+        + struct.pack('>I', zlib.crc32(kind + content)) for kind, content in chunks)
+
+
+def test_an_image_of_too_many_pixels_is_refused_by_its_header(tmp_path):
+    """The rows of 32000 x 32000 pixels have a gigabyte, and a megabyte when compressed."""
+    compressor = zlib.compressobj(9)
+    rows = b''.join(compressor.compress(bytes(32001)) for _ in range(3200)) * 10
+    data = png_of(32000, 32000, rows + compressor.flush())
+    assert MAX_PIXELS < 32000 ** 2 and len(data) < 2e6
+    tracemalloc.start()
+    with pytest.raises(KfvoError, match=f'up to {MAX_PIXELS} pixels, came one of 32000x32000'):
+        decode_compressed(data, 'png')
+    assert tracemalloc.get_traced_memory()[1] < 1e6
+    tracemalloc.stop()
+    (tmp_path / 'large.png').write_bytes(data)
+    with pytest.raises(KfvoError, match=r'large\.png: .*came one of 32000x32000'):
+        read_image(tmp_path / 'large.png')
+
+
+@pytest.mark.parametrize('name', ['folder', 'fifo', 'device'])
+def test_what_is_no_file_is_refused(name, tmp_path):
+    path = tmp_path / f'{name}.png'
+    if name == 'folder':
+        path.mkdir()
+    elif name == 'fifo':
+        os.mkfifo(path)
+    else:
+        path.symlink_to('/dev/zero')
+    kind = {'fifo': 'FIFO'}.get(name, name)
+    with pytest.raises(KfvoError, match=f'cannot read the image .* a file, found a {kind}'):
+        read_image(path)
 
 
 def test_files(tmp_path):

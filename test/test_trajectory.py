@@ -233,19 +233,28 @@ def test_kitti_rotations_are_orthonormal_despite_few_digits(tmp_path):
 
 
 @pytest.mark.parametrize('line', ['1 2 3', '1 0 0 0 0 1 0 0 0 0 1', '1 0 0 0 0 1 0 0 0 0 1 x',
-                                  '1 0 0 0 0 1 0 0 0 0 1 nan'])
-def test_the_error_names_a_bad_kitti_line(tmp_path, line):
+                                  '1 0 0 0 0 1 0 0 0 0 1 nan', '1 0 0 1e200 0 1 0 0 0 0 1 0'])
+def test_a_bad_kitti_line_is_left_out_with_its_stamp(tmp_path, line, caplog):
     path = tmp_path / '03.txt'
-    path.write_text(f'1 0 0 0 0 1 0 0 0 0 1 0\n{line}\n')
-    with pytest.raises(KfvoError, match='03.txt, line 2: expected "12 numbers"'):
+    good = '1 0 0 7 0 1 0 0 0 0 1 0'
+    path.write_text(f'{good}\n{line}\n{good}\n')
+    trajectory = read_kitti_poses(path, np.arange(3))
+    assert trajectory.stamps_ns.tolist() == [0, 2]
+    np.testing.assert_array_equal(trajectory.positions, [[7, 0, 0]] * 2)
+    assert '03.txt: left out 1 rows of 3; line 2: expected "12 numbers"' in caplog.text
+    path.write_text(f'{line}\n{line}\n')
+    with pytest.raises(KfvoError, match='03.txt, line 1: expected "12 numbers"'):
         read_kitti_poses(path, np.arange(2))
 
 
 @pytest.mark.parametrize('rotation', [np.zeros((3, 3)), np.diag([1.0, 1.0, -1.0]),
                                       2.0 * np.eye(3)], ids=['zero', 'mirror', 'scaled'])
-def test_a_kitti_matrix_that_is_no_rotation_is_refused(tmp_path, rotation):
+def test_a_kitti_matrix_that_is_no_rotation_is_left_out(tmp_path, rotation, caplog):
     path = tmp_path / '03.txt'
     write_kitti(path, geometry.make_transform(np.stack([np.eye(3), rotation]), np.zeros((2, 3))))
+    assert read_kitti_poses(path, np.arange(2)).stamps_ns.tolist() == [0]
+    assert 'left out 1 poses of 2 without a rotation, the first is pose 1' in caplog.text
+    write_kitti(path, geometry.make_transform(np.stack([rotation] * 2), np.zeros((2, 3))))
     with pytest.raises(KfvoError, match='03.txt.*rotation'):
         read_kitti_poses(path, np.arange(2))
 

@@ -14,6 +14,7 @@ from kfvo_ros.errors import KfvoError
 from kfvo_ros.sequences import euroc, image_folder, kitti, tartanair, tum, video
 from kfvo_ros.sequences.bag import sequence as bag
 from kfvo_ros.sequences.base import Sequence, SequenceSettings
+from kfvo_ros.sequences.calibration import CameraCalibration
 
 SYNTHETIC = 'synthetic'
 KINDS = {module.KIND.name: module.KIND
@@ -21,7 +22,8 @@ KINDS = {module.KIND.name: module.KIND
 """Kinds of sequences on disk, in the order of detection."""
 
 
-def open_sequence(source: str, *, kind: str | None = None, camera: Camera | None = None,
+def open_sequence(source: str, *, kind: str | None = None,
+                  camera: Camera | CameraCalibration | None = None,
                   image_topic: str | None = None, ground_truth_topic: str | None = None,
                   ground_truth_to_camera: np.ndarray | None = None,
                   rate: float = 10.0) -> Sequence:
@@ -39,14 +41,19 @@ def open_sequence(source: str, *, kind: str | None = None, camera: Camera | None
 
     Args:
         source: A path, or ``synthetic:SEED[:STYLE]`` for a rendered scene. Paths may be an EuRoC
-            folder (with ``mav0``), a TUM RGB-D folder, KITTI ``sequences/NN``, a TartanAir
-            trajectory, a ROS 1 or ROS 2 bag, a folder of images or a video file.
+            or TUM VI folder (with ``mav0``), a TUM RGB-D folder, KITTI ``sequences/NN`` or a
+            raw drive, a TartanAir trajectory, a ROS 1 or ROS 2 bag, a folder of images or a
+            video file.
         kind: Name of one of KINDS or ``synthetic``; detected by default.
-        camera: Calibration that overrides all others. By default a ``camera_info.yaml`` in the
-            folder is used, else the dataset's own calibration or the bag's CameraInfo, else a
-            guess, with a warning (``sequence.camera.guessed``).
-        image_topic: Image topic of a bag; by default the first by name without "depth" in it.
-        ground_truth_topic: Ground truth topic of a bag; chosen by message type by default.
+        camera: Calibration that overrides all others: the Camera of the images, or the
+            CameraCalibration of a file, of which rectified topics have another camera than raw
+            ones. By default a ``camera_info.yaml`` in the folder is used, else the dataset's own
+            calibration or the bag's CameraInfo, else a guess, with a warning
+            (``sequence.camera.guessed``).
+        image_topic: Image topic of a bag; by default the first by name of those with a
+            CameraInfo, never one of depth images.
+        ground_truth_topic: Ground truth topic of a bag; chosen by name and message type by
+            default.
         ground_truth_to_camera: T_body_camera (4, 4), the camera on the body whose ground truth
             a bag recorded; by default the bag's static transforms are used.
         rate: Frames per second [Hz] of sources without stamps: folders, TartanAir, and videos

@@ -11,15 +11,18 @@ example.
 from __future__ import annotations
 
 import logging
+import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from kfvo_ros.camera import Camera, guess_camera, read_camera_info
-from kfvo_ros.errors import KfvoError
+from kfvo_ros.camera import Camera, guess_camera
+from kfvo_ros.errors import KfvoError, reason_of
+from kfvo_ros.sequences.calibration import CameraCalibration, read_calibration
 from kfvo_ros.trajectory import Trajectory
 
 BODY_FRAME = 'body'
@@ -74,6 +77,16 @@ class Sequence(ABC):
     topic: str = '/camera/image_raw'
     camera_frame: str = 'camera_optical_frame'
 
+    @property
+    def left_out(self) -> dict[str, int]:
+        """Number of images left out so far by the reason; ``late``, ``odd_stamp`` and others."""
+        return {}
+
+    @property
+    def sources(self) -> dict[str, str]:
+        """What was chosen among several, by key of the summary; topics of a bag."""
+        return {}
+
     @abstractmethod
     def __iter__(self) -> Iterator[Frame]:
         """Yield the frames, stamps strictly increasing; KfvoError at one that is unreadable."""
@@ -92,11 +105,42 @@ class Sequence(ABC):
         return ()
 
 
+@contextmanager
+def choices_logged() -> Iterator[None]:
+    """Show the choices among topics and transforms, which are logged at level INFO."""
+    logger = logging.getLogger('kfvo_ros.sequences')
+    level = logger.level
+    logger.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
+
+
+def read_ground_truth(sequence: Sequence) -> tuple[GroundTruth | None, str | None]:
+    """Return the ground truth, and the problem where it cannot be read: odometry needs none."""
+    try:
+        return sequence.ground_truth(), None
+    except (KfvoError, ValueError, ArithmeticError, LookupError, TypeError, OSError) as error:
+        _log.warning('%s: no ground truth: %s', sequence.name, reason_of(error))
+        return None, reason_of(error)
+
+
+def check_complete(sequence: Sequence, frame_count: int) -> None:
+    """Log a warning where a sequence read to its end has fewer frames than its source states."""
+    stated = sequence.length
+    if stated is not None and frame_count < stated:
+        left_out = sum(sequence.left_out.values())
+        _log.warning('%s: read %d of the %d frames that it should have%s', sequence.name,
+                     frame_count, stated, f'; {left_out} were left out' if left_out else
+                     ': it is cut or damaged')
+
+
 @dataclass(frozen=True)
 class SequenceSettings:
     """User settings of a sequence; each kind ignores those that do not apply to it."""
 
-    camera: Camera | None = None
+    camera: Camera | CameraCalibration | None = None
     """Overrides every calibration that comes with the sequence."""
 
     image_topic: str | None = None
@@ -126,13 +170,15 @@ class SequenceKind:
 class Calibration:
     """Sources of a sequence's camera, in order of precedence.
 
-    First ``override``, the user's camera; then CALIBRATION_FILE in ``folder``; then
+    First ``override``, the user's; then CALIBRATION_FILE in ``folder``; then
     ``from_dataset(width, height)``, which is called only without the first two; last a guess.
+    ``rectified`` images have the camera of the rectified images in a file.
     """
 
-    override: Camera | None
+    override: Camera | CameraCalibration | None
     folder: Path
     from_dataset: Callable[[int, int], Camera | None] = lambda width, height: None
+    rectified: bool = False
 
     def camera(self, name: str, width: int, height: int) -> Camera:
         """Return the camera of images of this size; a guess is logged as a warning.
@@ -140,14 +186,14 @@ class Calibration:
         Raises KfvoError naming the sequence when a calibration is broken or of another aspect
         ratio.
         """
-        path = self.folder / CALIBRATION_FILE
-        if self.override is not None:
-            camera = self.override
-        elif path.is_file():
-            camera = read_camera_info(path)
-        else:
+        camera, path = self.override, self.folder / CALIBRATION_FILE
+        if camera is None and os.path.lexists(path):
+            camera = read_calibration(path)
+        if camera is None:
             camera = self.from_dataset(width, height) or _guess(name, width, height)
         try:
+            if isinstance(camera, CameraCalibration):
+                camera = camera.camera(self.rectified)
             return camera.scaled(width, height)
         except KfvoError as error:
             raise KfvoError(f'{name}: {error}') from error

@@ -6,15 +6,17 @@ from __future__ import annotations
 
 import logging
 import math
+import os
 import re
 from collections.abc import Callable, Iterable, Iterator
+from decimal import Decimal
 from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
 
 from kfvo_ros.camera import Camera
-from kfvo_ros.errors import KfvoError, reason_of
+from kfvo_ros.errors import KfvoError, printable, reason_of
 from kfvo_ros.images import read_image
 from kfvo_ros.sequences.base import (
     BODY_FRAME,
@@ -26,7 +28,8 @@ from kfvo_ros.sequences.base import (
     SequenceKind,
     SequenceSettings,
 )
-from kfvo_ros.trajectory import NANOSECONDS
+from kfvo_ros.sequences.stamps import PERSISTENCE, OrderedImages
+from kfvo_ros.trajectory import NANOSECONDS, format_stamp
 
 IMAGE_SUFFIXES = frozenset(('.png', '.jpg', '.jpeg', '.bmp', '.pgm', '.ppm', '.tif', '.tiff',
                             '.webp'))
@@ -36,8 +39,8 @@ _log = logging.getLogger(__name__)
 class ImageListSequence(Sequence):
     """Stamped image files of one folder, decoded one at a time.
 
-    `images` are (stamp_ns, file name); images whose stamp does not increase are dropped with a
-    warning. `ground_truth` and `T_body_camera` are read at the call of `ground_truth` and
+    `images` are (stamp_ns, file name); those that are late or have an odd stamp are left out with
+    a warning. `ground_truth` and `T_body_camera` are read at the call of `ground_truth` and
     `extrinsics`. The first image is read at construction, because the camera depends on its
     size. Raises KfvoError without images, and for a first image or calibration that is broken.
     """
@@ -48,15 +51,15 @@ class ImageListSequence(Sequence):
                  calibration: Calibration,
                  ground_truth: Callable[[], GroundTruth | None] = lambda: None,
                  T_body_camera: Callable[[], np.ndarray | None] = lambda: None) -> None:
-        self.name = name
+        self.name = printable(name)
         self._folder = folder
-        self._images = _with_increasing_stamps(name, images)
+        self._images, self._left_out = _select_ordered(self.name, images)
         self._read_ground_truth = ground_truth
         self._read_T_body_camera = T_body_camera
         if not self._images:
             raise KfvoError(f'{name}: expected images in {folder}, none is listed')
         height, width = read_image(folder / self._images[0][1]).shape[:2]
-        self.camera = calibration.camera(name, width, height)
+        self.camera = calibration.camera(self.name, width, height)
 
     def __iter__(self) -> Iterator[Frame]:
         """Yield the frames; raises KfvoError for a missing, broken or differently sized file."""
@@ -74,6 +77,11 @@ class ImageListSequence(Sequence):
         """Number of frames."""
         return len(self._images)
 
+    @property
+    def left_out(self) -> dict[str, int]:
+        """Number of images left out, by the reason."""
+        return dict(self._left_out)
+
     def ground_truth(self) -> GroundTruth | None:
         """Read and return the measured trajectory, None where there is none."""
         return self._read_ground_truth()
@@ -86,10 +94,14 @@ class ImageListSequence(Sequence):
 
 
 def list_images(folder: Path) -> list[str]:
-    """Return the names of a folder's image files in natural order: 9.png before 10.png."""
+    """Return the names of a folder's image files in natural order: 9.png before 10.png.
+
+    ``a (1).png``, a copy of ``a.png``, follows it.
+    """
     try:
         names = [path.name for path in folder.iterdir()
-                 if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith('.')]
+                 if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith('.')
+                 and not path.is_dir()]
     except OSError as error:
         raise KfvoError(f'cannot list the folder {folder}: {reason_of(error)}') from error
     return sorted(names, key=_natural_order)
@@ -121,24 +133,31 @@ def _matches(path: Path) -> bool:
 KIND = SequenceKind('folder', 'a folder of images', _matches, open_folder)
 
 
-def _natural_order(name: str) -> list[tuple[int, str]]:
-    """Return a sort key in which runs of digits compare as numbers."""
-    return [(int(part), '') if part.isdigit() and part.isascii() else (-1, part)
-            for part in re.split(r'([0-9]+)', name)]
+def _natural_order(name: str) -> tuple[list[tuple[Decimal, str]], str]:
+    """Return a sort key: runs of digits compare as numbers, without the suffix.
+
+    Seconds since 1970 may have decimals, of which Python leaves out zeros at the end.
+    """
+    stem = os.path.splitext(name)[0]
+    return [(Decimal(part), '') if index % 2 else (Decimal(-1), part)
+            for index, part in enumerate(re.split(r'([0-9]{9,}\.[0-9]+|[0-9]+)', stem))], name
 
 
-def _with_increasing_stamps(name: str, images: Iterable[tuple[int, str]]
-                            ) -> list[tuple[int, str]]:
-    """Return the images without those whose stamp does not increase; log their number."""
-    kept: list[tuple[int, str]] = []
-    dropped = 0
-    for stamp_ns, file_name in images:
-        if kept and stamp_ns <= kept[-1][0]:
-            dropped += 1
-        else:
-            kept.append((stamp_ns, file_name))
-    if dropped:
-        _log.warning('%s: left out %d images whose stamps do not increase', name, dropped)
-    return kept
+def _select_ordered(name: str, images: Iterable[tuple[int, str]]
+                    ) -> tuple[list[tuple[int, str]], dict[str, int]]:
+    """Return the images with credible, increasing stamps, and the numbers of the others.
 
-
+    Raises KfvoError for three and more stamps that are all the same.
+    """
+    images = list(images)
+    if len(images) >= PERSISTENCE and len({stamp_ns for stamp_ns, _ in images}) == 1:
+        raise KfvoError(f'{name}: expected increasing stamps, all {len(images)} images have '
+                        f'{format_stamp(images[0][0])} s; put them right, or use the folder of '
+                        'the images with --kind folder and --rate')
+    ordered: OrderedImages[str] = OrderedImages()
+    kept = list(ordered.select((stamp_ns, None, file_name) for stamp_ns, file_name in images))
+    left_out = dict(ordered.left_out)
+    if left_out:
+        _log.warning('%s: left out %d images whose stamps do not increase or are odd', name,
+                     sum(left_out.values()))
+    return kept, left_out

@@ -15,7 +15,7 @@ from pathlib import Path
 from kfvo_ros.camera import Camera
 from kfvo_ros.sequences.base import Calibration, GroundTruth, SequenceKind, SequenceSettings
 from kfvo_ros.sequences.image_folder import ImageListSequence
-from kfvo_ros.trajectory import parse_stamp_ns, read_tum
+from kfvo_ros.trajectory import parse_stamp_ns, read_pose_table
 from kfvo_ros.utils.files import read_rows
 
 KINECT_READOUT = 0.030
@@ -39,7 +39,7 @@ def open_tum(path: Path, settings: SequenceSettings) -> ImageListSequence:
                              partial(_read_ground_truth, path / 'groundtruth.txt'))
 
 
-KIND = SequenceKind('tum', 'TUM RGB-D: a folder with rgb.txt',
+KIND = SequenceKind('tum', 'TUM RGB-D: rgb.txt',
                     lambda path: (path / 'rgb.txt').is_file(), open_tum)
 
 
@@ -55,4 +55,4 @@ def _camera_of(name: str, width: int, height: int) -> Camera | None:
 
 def _read_ground_truth(path: Path) -> GroundTruth | None:
     """Return the file's poses, which are those of the colour camera's optical frame."""
-    return GroundTruth(read_tum(path)) if path.is_file() else None
+    return GroundTruth(read_pose_table(path, parse_stamp_ns)) if path.is_file() else None

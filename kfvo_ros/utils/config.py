@@ -18,12 +18,14 @@ from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from typing import Any, TypeVar
 
-from kfvo_ros.errors import KfvoError
+from kfvo_ros.errors import KfvoError, quoted
 
 Options = TypeVar('Options')
 Range = tuple[float | None, float | None]
 NO_RANGES: Mapping[str, Range] = types.MappingProxyType({})
 KINDS = {int: 'a whole number', float: 'a number', bool: 'true or false', str: 'text'}
+MOST = {int: 2 ** 31 - 1, float: 1e9}
+"""Largest number of an option that declares no smaller one."""
 TRUE, FALSE = ('true', 'yes', 'on', '1'), ('false', 'no', 'off', '0')
 
 
@@ -49,7 +51,8 @@ required = functools.partial(option, MISSING, '')
 class Option:
     """One field of an options dataclass: its declaration and the type of its values.
 
-    ``kind`` is the type without None and, of a tuple, that of its elements.
+    ``kind`` is the type without None and, of a tuple, that of its elements. Every number has a
+    largest value.
     """
 
     name: str
@@ -65,6 +68,10 @@ class Option:
     flag: str = ''
     key: str = ''
     within: Mapping[str, Range] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.most is None and not self.choices:
+            object.__setattr__(self, 'most', MOST.get(self.kind))
 
     @property
     def expected(self) -> str:
@@ -107,7 +114,7 @@ class Option:
 
     def _error(self, value: Any) -> ValueError:
         """Return the error that names the allowed values and the value."""
-        return ValueError(f'expected {self.expected}, came {value!r}')
+        return ValueError(f'expected {self.expected}, came {quoted(value)}')
 
     def _allows(self, value: Any) -> bool:
         """Whether a value of the right type is one of the choices or within the range."""
@@ -242,7 +249,8 @@ def _value_of(declared: Option, value: Any, file: str, key: str, range_: Range |
     try:
         return declared.check(value)
     except (ValueError, OverflowError):
-        raise KfvoError(f'{file}: {key}: expected {declared.expected}; came {value!r}') from None
+        raise KfvoError(f'{file}: {key}: expected {declared.expected}; came '
+                        f'{quoted(value)}') from None
 
 
 def _number(text: str) -> Any:
@@ -255,4 +263,4 @@ def _number(text: str) -> Any:
 
 def _unexpected(file: str, parent: str, declared: Mapping[str, Option], came: Any) -> KfvoError:
     return KfvoError(f'{file}: {f"{parent}: " if parent else ""}expected the keys '
-                     f'{", ".join(declared)}; came {came!r}')
+                     f'{", ".join(declared)}; came {quoted(came)}')

@@ -163,48 +163,83 @@ def test_static_transforms_are_no_ground_truth(tmp_path):
 
 
 def test_choice_of_the_ground_truth_topic(tmp_path, caplog):
-    """The default is the first by type, then by name; a requested topic wins."""
+    """The first by type, then by name; topics named odometry come last; a requested one wins."""
     caplog.set_level(logging.INFO)
     writer = BagBuilder('mcap')
     others = {'/a/point': writer.point_stamped, '/b/transform': writer.transform,
-              '/d/odometry': writer.odometry, '/c/odometry': writer.odometry,
-              '/e/pose': writer.pose_stamped}
+              '/d/state': writer.odometry, '/c/state': writer.odometry,
+              '/e/pose': writer.pose_stamped, '/a/odometry': writer.odometry}
     sequence = open_bag(writer, tmp_path, images(writer), static_chain(writer), *(
         truth_records(writer, topic, make, make_poses(COUNT, seed))
         for seed, (topic, make) in enumerate(others.items())))
     T_world_camera = make_poses(COUNT, 3) @ T_BODY_MOUNT @ T_MOUNT_CAMERA
     assert_poses(sequence.ground_truth(), 'camera', T_world_camera)
-    choice = next(record.message for record in caplog.records if 'candidates' in record.message)
-    assert '/c/odometry is taken' in choice
-    assert choice.endswith('other candidates: /d/odometry, /e/pose, /b/transform, /a/point')
+    assert sequence.sources == {'image_topic': '/cam0/image_raw', 'ground_truth_topic': '/c/state'}
+    choice = next(record for record in caplog.records if 'candidates' in record.message)
+    assert '/c/state is taken' in choice.message and choice.levelno == logging.INFO
+    assert choice.message.endswith(
+        'other candidates: /d/state, /e/pose, /b/transform, /a/point, /a/odometry')
     bag = str(tmp_path / 'walk')
     requested = open_sequence(bag, camera=PINHOLE, ground_truth_topic='e/pose')
     assert_poses(requested.ground_truth(), '/e/pose', make_poses(COUNT, 4))
-    wrong = open_sequence(bag, camera=PINHOLE, ground_truth_topic='/cam0/image_raw')
-    with pytest.raises(KfvoError, match='/cam0/image_raw holds no poses.*these do: /a/point'):
-        wrong.ground_truth()
+    assert requested.sources['ground_truth_topic'] == '/e/pose'
+    with pytest.raises(KfvoError, match='/cam0/image_raw holds no poses.*these do: /a/odometry'):
+        open_sequence(bag, camera=PINHOLE, ground_truth_topic='/cam0/image_raw')
 
 
-def test_invalid_poses_of_motion_capture_are_left_out(tmp_path):
+@pytest.mark.parametrize(('topics', 'chosen'), [
+    ({'/odom': 'odometry', '/vrpn/robot/pose': 'pose_stamped'}, '/vrpn/robot/pose'),
+    ({'/odom': 'odometry', '/leica/position': 'point_stamped'}, '/leica/position'),
+    ({'/wheel/state': 'odometry', '/robot/pose': 'pose_stamped'}, '/robot/pose'),
+    ({'/pose': 'pose_stamped', '/ground_truth/odometry': 'odometry'}, '/ground_truth/odometry'),
+    ({'/robot/pose': 'pose_stamped', '/vicon/robot': 'transform'}, '/vicon/robot')])
+def test_a_measuring_system_is_preferred(topics, chosen, tmp_path, caplog):
+    writer = BagBuilder('mcap')
+    sequence = open_bag(writer, tmp_path, images(writer), *(
+        truth_records(writer, topic, getattr(writer, make)) for topic, make in topics.items()))
+    assert len(sequence.ground_truth().trajectory) == COUNT
+    assert sequence.sources['ground_truth_topic'] == chosen and not caplog.records
+
+
+def test_odometry_of_wheels_is_taken_with_a_warning(tmp_path, caplog):
+    """Also before /tf, whose transforms may be those of wheels and joints."""
+    writer = BagBuilder('mcap')
+    joints = [('/tf', stamp, writer.transforms(writer.transform(stamp, pose, 'wheel', 'base')))
+              for stamp, pose in zip(STAMPS_NS, make_poses(COUNT, 5))]
+    sequence = open_bag(writer, tmp_path, images(writer), joints,
+                        truth_records(writer, '/odom', writer.odometry))
+    assert_poses(sequence.ground_truth(), 'body', POSES)
+    warning, = caplog.records
+    assert '/odom is taken for the ground truth, but its name says odometry' in warning.message
+    assert 'other candidates: /tf' in warning.message
+
+
+def test_invalid_poses_of_motion_capture_are_left_out(tmp_path, caplog):
     writer = BagBuilder('mcap')
     records = truth_records(writer, '/truth', writer.pose_stamped)
     records[1][2].pose.position.x = float('nan')
     orientation = records[3][2].pose.orientation
     orientation.x = orientation.y = orientation.z = orientation.w = 0.0
+    records[4][2].pose.position.z = 1e200
     truth = open_bag(writer, tmp_path, images(writer), records).ground_truth()
-    assert truth.trajectory.stamps_ns.tolist() == [STAMPS_NS[index] for index in (0, 2, 4)]
-    np.testing.assert_allclose(truth.trajectory.poses, POSES[[0, 2, 4]], atol=1e-12)
+    assert truth.trajectory.stamps_ns.tolist() == [STAMPS_NS[index] for index in (0, 2)]
+    np.testing.assert_allclose(truth.trajectory.poses, POSES[[0, 2]], atol=1e-12)
+    assert 'left out 3 of 5 poses on /truth' in caplog.text
 
 
 def test_motion_capture_without_a_valid_pose(tmp_path):
+    """The next candidate is taken, where there is one."""
     writer = BagBuilder('mcap')
     records = truth_records(writer, '/truth', writer.pose_stamped)
     for _, _, message in records:
         message.pose.position.x = float('nan')
     assert open_bag(writer, tmp_path, images(writer), records).ground_truth() is None
     requested = open_sequence(str(tmp_path / 'walk'), camera=PINHOLE, ground_truth_topic='/truth')
-    with pytest.raises(KfvoError, match='expected a pose.* on /truth, found none'):
+    with pytest.raises(KfvoError, match='expected a credible pose on /truth, found none'):
         requested.ground_truth()
+    records += truth_records(writer, '/zed/pose', writer.pose_stamped)
+    other = open_bag(writer, tmp_path / 'two', images(writer), records)
+    assert_poses(other.ground_truth(), '/zed/pose', POSES)
 
 
 @pytest.mark.parametrize('matrix', [2 * np.eye(4), np.diag([1.0, 1, -1, 1]), np.eye(3), 'x'])

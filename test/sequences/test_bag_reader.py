@@ -4,10 +4,14 @@
 
 from __future__ import annotations
 
+import sqlite3
+
+import numpy as np
 import pytest
-from bag_writers import POSES, STAMPS_NS, START_NS, BagBuilder, images, truth_records
+from bag_writers import LATER_NS, POSES, STAMPS_NS, START_NS, BagBuilder, images, truth_records
 from rosbags.typesys import Stores, get_typestore
 
+from kfvo_ros.errors import KfvoError
 from kfvo_ros.sequences.bag.reader import Bag, QosOffer
 
 END_NS = 2 ** 62
@@ -71,9 +75,47 @@ def test_qos_offer_of_ros1(tmp_path):
         assert bag.qos_offer('/other') == QosOffer(reliable=True, latched=False, depth=0)
 
 
-def test_image_topics_are_sorted_by_name_with_depth_last(tmp_path):
-    writer = BagBuilder('mcap')
-    names = ('/zed/image', '/camera/depth/image', '/camera/rgb/image')
-    records = [record for name in names for record in images(writer, name)]
-    with Bag(writer.write(tmp_path / 'bag', records)) as bag:
-        assert bag.image_topics() == ['/camera/rgb/image', '/zed/image', '/camera/depth/image']
+@pytest.mark.parametrize('storage', ['ros1', 'mcap'])
+def test_a_definition_that_lacks_a_field_is_one_clear_error(storage, tmp_path):
+    writer = BagBuilder(storage)
+    name = 'sensor_msgs/msg/Image'
+    store = get_typestore(Stores.ROS1_NOETIC if storage == 'ros1' else Stores.ROS2_JAZZY)
+    fields = store.fielddefs[name]
+    writer.store = get_typestore(Stores.EMPTY)
+    writer.store.register({**{kind: store.fielddefs[kind] for kind in (
+        'std_msgs/msg/Header', 'builtin_interfaces/msg/Time')}, name: (
+            fields[0], [field for field in fields[1] if field[0] != 'step'])})
+    image = writer.store.types[name](header=writer.header(START_NS), height=1, width=1,
+                                     encoding='mono8', is_bigendian=0,
+                                     data=np.zeros(1, np.uint8))
+    with Bag(writer.write(tmp_path / 'bag', [('/image', START_NS, image)])) as bag, \
+            pytest.raises(KfvoError, match='definition of sensor_msgs/msg/Image has no step'):
+        bag.first_message('/image')
+
+
+def test_a_message_that_cannot_be_decoded_is_left_out(tmp_path, caplog):
+    writer = BagBuilder('sqlite3')
+    path = writer.write(tmp_path / 'bag', truth_records(writer, '/pose', writer.pose_stamped))
+    with sqlite3.connect(path / 'bag.db3') as database:
+        database.execute("UPDATE messages SET data = X'00010000' WHERE id = 3")
+    database.close()
+    with Bag(path) as bag:
+        assert [bag_time_ns for bag_time_ns, _ in bag.messages('/pose')] == [
+            stamp_ns + LATER_NS for stamp_ns in STAMPS_NS if stamp_ns != STAMPS_NS[2]]
+    assert 'a message on /pose' in caplog.text and 'left out' in caplog.text
+
+
+def test_a_broken_definition_spoils_no_other_topic(tmp_path, caplog):
+    writer = BagBuilder('sqlite3')
+    path = writer.write(tmp_path / 'bag', [
+        *truth_records(writer, '/pose', writer.pose_stamped),
+        *truth_records(writer, '/point', writer.point_stamped)])
+    with sqlite3.connect(path / 'bag.db3') as database:
+        database.execute('UPDATE message_definitions SET encoded_message_definition = "float x y" '
+                         'WHERE topic_type = "geometry_msgs/msg/PointStamped"')
+    database.close()
+    with Bag(path) as bag:
+        assert bag.topics == {'/pose': 'geometry_msgs/msg/PoseStamped'}
+        assert list(bag.passed_over) == ['/point']
+        assert len(list(bag.messages('/pose'))) == len(STAMPS_NS)
+    assert '/point is passed over' in caplog.text

@@ -4,9 +4,11 @@
 
 from __future__ import annotations
 
+import struct
 import tracemalloc
 from collections import Counter
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -25,12 +27,13 @@ from recordings import (
 from rosbags.highlevel import AnyReader
 from sequence_writers import HEIGHT, WIDTH, make_image, write_euroc
 
-from kfvo_ros.camera import Camera, read_camera_info, write_camera_info
+from kfvo_ros.camera import Camera
 from kfvo_ros.sequences import KINDS, open_sequence
 from kfvo_ros.sequences.bag.camera import camera_from_info
 from kfvo_ros.sequences.bag.messages import camera_info_message
 from kfvo_ros.sequences.bag.recorder import Recorder
 from kfvo_ros.sequences.bag.writer import BagWriter
+from kfvo_ros.sequences.calibration import read_camera_info, write_camera_info
 
 # Round trips
 
@@ -173,14 +176,47 @@ def test_chunks(zstd, tmp_path):
         assert {chunk.compression for chunk in reader.get_summary().chunk_indexes} == {
             'zstd' if zstd else ''}
         assert sum(1 for _ in reader.iter_messages()) == 3 * COUNT + 1
+        for index in reader.get_summary().chunk_indexes:
+            file.seek(index.chunk_start_offset + 9 + 24)
+            assert struct.unpack('<I', file.read(4))[0] != 0  # the CRC
 
 
-def test_the_readout_time_is_kept_in_a_calibration_file(tmp_path):
-    copy = convert_and_open(write_sequence('tum', tmp_path), tmp_path / 'out')
+@pytest.mark.parametrize('codec', [[], ['--compressed']])
+def test_the_readout_time_is_kept_in_a_metadata_record(codec, tmp_path):
+    """Older recordings have a calibration file for it, which takes precedence."""
+    copy = convert_and_open(write_sequence('tum', tmp_path), tmp_path / 'out', *codec)
     assert copy.camera.readout_s == 0.03
-    (tmp_path / 'out' / 'camera_info.yaml').unlink()
-    without = open_sequence(str(tmp_path / 'out')).camera
-    assert without == replace(copy.camera, readout_s=0.0)
+    assert sorted(path.name for path in (tmp_path / 'out').iterdir()) == ['metadata.yaml',
+                                                                          'out.mcap']
+    write_camera_info(tmp_path / 'out' / 'camera_info.yaml', replace(copy.camera, readout_s=0.02))
+    assert open_sequence(str(tmp_path / 'out')).camera.readout_s == 0.02
+
+
+def test_names_that_ros2_refuses_are_changed(tmp_path, caplog):
+    writer = BagBuilder('ros1')
+    path = writer.write(tmp_path / 'walk', images(writer, '/cam/1/image_raw') + truth_records(
+        writer, '/mocap/1/pose', writer.pose_stamped))
+    copy = convert_and_open(str(path), tmp_path / 'out')
+    assert set(topics_of(tmp_path / 'out')) == {'/cam/id_1/image_raw', '/mocap/id_1/pose'}
+    assert copy.ground_truth().frame == '/mocap/id_1/pose'
+    assert 'does not allow the topic /mocap/1/pose' in caplog.text
+
+
+def test_ground_truth_problems_do_not_stop_a_conversion(tmp_path, caplog):
+    source = write_sequence('tartanair', tmp_path)
+    Path(source, 'pose_left.txt').write_text('no poses')
+    copy = convert_and_open(source, tmp_path / 'out')
+    assert len(list(copy)) == COUNT and copy.ground_truth() is None
+    assert 'pose_left.txt, line 1' in caplog.text
+
+
+def test_ground_truth_outside_ros_time_is_left_out(tmp_path, caplog):
+    source = write_sequence('tum', tmp_path)
+    file = Path(source, 'groundtruth.txt')
+    file.write_text(file.read_text() + '5000000000.0 0 0 0 0 0 0 1\n-5 0 0 0 0 0 0 1\n')
+    copy = convert_and_open(source, tmp_path / 'out')
+    assert len(copy.ground_truth().trajectory) == COUNT
+    assert f'left out 2 of {COUNT + 2} poses of the ground truth' in caplog.text
 
 
 def test_a_guessed_camera_is_not_recorded(tmp_path, capsys):

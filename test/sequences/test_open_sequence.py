@@ -84,6 +84,16 @@ def test_video(tmp_path):
             assert np.abs(frame.image.astype(int) - image).max() <= 6
 
 
+def test_a_cut_video_is_a_warning(tmp_path, caplog):
+    path = tmp_path / 'walk.avi'
+    write_video(path, 6, 20.0)
+    open_sequence(str(path))
+    assert not [each for each in caplog.messages if 'shorter' in each]
+    path.write_bytes(path.read_bytes()[:-40])
+    open_sequence(str(path))
+    assert [each for each in caplog.messages if 'walk.avi: the file is shorter' in each]
+
+
 def test_broken_video(tmp_path):
     (tmp_path / 'broken.avi').write_bytes(b'RIFF, but no more')
     with pytest.raises(KfvoError, match=r'cannot open the video .*broken\.avi'):

@@ -4,26 +4,32 @@
 
 from __future__ import annotations
 
-import re
+import logging
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
-from kfvo_ros.camera import write_camera_info
 from kfvo_ros.errors import KfvoError
-from kfvo_ros.sequences.bag.camera import camera_info_topic, is_rectified
+from kfvo_ros.sequences.bag.camera import CAMERA_RECORD, camera_info_topic, is_rectified
 from kfvo_ros.sequences.bag.messages import (
+    END_NS,
     camera_info_message,
     compressed_message,
-    header_of,
     image_message,
     odometry_message,
     point_message,
     static_transforms_message,
 )
+from kfvo_ros.sequences.bag.topics import is_legal_topic, legal_topic
 from kfvo_ros.sequences.bag.writer import LATCHED, BagWriter
-from kfvo_ros.sequences.base import CALIBRATION_FILE, Frame, GroundTruth, Sequence
+from kfvo_ros.sequences.base import (
+    FixedTransform,
+    Frame,
+    GroundTruth,
+    Sequence,
+    read_ground_truth,
+)
 from kfvo_ros.trajectory import ASSOCIATION_LIMIT_NS
 
 STATIC_TOPIC = '/tf_static'
@@ -31,7 +37,7 @@ ODOMETRY_TOPIC = '/ground_truth/odometry'
 POINT_TOPIC = '/ground_truth/position'
 WORLD_FRAME = 'world'
 """The frame of ground truth poses."""
-_TOPIC = re.compile(r'(?!.*__)(/[A-Za-z_][A-Za-z0-9_]*)+')
+_log = logging.getLogger(__name__)
 
 
 class Recorder:
@@ -40,7 +46,8 @@ class Recorder:
     Images go to `topic`, by default the sequence's own, with ``/compressed`` appended when a
     `codec` compresses them. CameraInfo goes beside them, except for an unknown or guessed
     camera: ``camera`` is then None, because a reader would take a guess for a calibration.
-    Raises KfvoError for invalid or conflicting topics and for ground truth outside ROS time.
+    Names that ROS 2 does not allow are changed with a warning. Ground truth that cannot be read
+    is left out with a warning. Raises KfvoError for an invalid `topic` and conflicting ones.
     """
 
     def __init__(self, sequence: Sequence, writer: BagWriter, topic: str | None = None,
@@ -50,11 +57,10 @@ class Recorder:
         self.frame_count = 0
         self._writer, self._codec = writer, codec
         self._camera_frame = sequence.camera_frame
-        self._transforms = sequence.extrinsics()
-        ground_truth = sequence.ground_truth()
-        self._ground_truth = None if ground_truth is None else \
-            GroundTruthMessages(ground_truth, self._camera_frame)
-        raw_topic = _valid_topic(topic or sequence.topic)
+        self._transforms = _read_extrinsics(sequence)
+        self._ground_truth = _make_ground_truth(sequence)
+        raw_topic = _raw_topic(topic) if topic else \
+            _allowed(f'/{sequence.topic.strip("/")}').removesuffix('/compressed')
         self._image_topic = f'{raw_topic}/compressed' if codec else raw_topic
         self._info_topic = camera_info_topic(raw_topic)
         self._check_topic(raw_topic)
@@ -77,10 +83,10 @@ class Recorder:
     def finish(self, complete: bool) -> None:
         """Close the bag; unless `complete`, omit the ground truth after the last frame."""
         self._write_ground_truth(None if complete else self._last_ns + ASSOCIATION_LIMIT_NS)
-        self._writer.close()
         if self.camera is not None and self.camera.readout_s > 0.0:
-            # CameraInfo has no field for the readout time; `BagSequence` reads this file.
-            write_camera_info(self._writer.path / CALIBRATION_FILE, self.camera)
+            self._writer.add_metadata(CAMERA_RECORD, {  # CameraInfo cannot hold it
+                'image_topic': self._image_topic, 'readout_s': repr(self.camera.readout_s)})
+        self._writer.close()
 
     def _image_message(self, frame: Frame) -> Any:
         if self._codec is None:
@@ -116,20 +122,21 @@ class GroundTruthMessages:
 
     At the camera, the child frame is `camera_frame`, so that a reader needs no transform. A
     measured frame that is identified by its topic keeps the topic, with an empty child frame.
-    Raises KfvoError for stamps that ROS cannot represent.
+    ``left_out`` counts the poses whose stamps ROS cannot represent.
     """
 
     def __init__(self, ground_truth: GroundTruth, camera_frame: str) -> None:
-        order = np.argsort(ground_truth.trajectory.stamps_ns, kind='stable')
-        self._trajectory = ground_truth.trajectory.select(order)
+        stamps_ns = ground_truth.trajectory.stamps_ns
+        order = np.argsort(stamps_ns, kind='stable')
+        in_ros_time = (stamps_ns[order] >= 0) & (stamps_ns[order] < END_NS)
+        self.left_out = int(len(order) - in_ros_time.sum())
+        self._trajectory = ground_truth.trajectory.select(order[in_ros_time])
         self._next = 0
         is_topic = ground_truth.frame.startswith('/')
         default_topic = ODOMETRY_TOPIC if self._trajectory.has_rotation else POINT_TOPIC
-        self.topic = ground_truth.frame if is_topic else default_topic
+        self.topic = _allowed(ground_truth.frame) if is_topic else default_topic
         frame = camera_frame if ground_truth.frame == 'camera' else ground_truth.frame
         self._child_frame = '' if is_topic else frame
-        for extreme_ns in (*self._trajectory.stamps_ns[:1], *self._trajectory.stamps_ns[-1:]):
-            header_of(int(extreme_ns), WORLD_FRAME)
 
     def earliest_ns(self, other_ns: int) -> int:
         """Return the earlier of the first stamp and another."""
@@ -150,9 +157,39 @@ class GroundTruthMessages:
         return point_message(stamp_ns, WORLD_FRAME, pose)
 
 
-def _valid_topic(name: str) -> str:
-    """Return the absolute topic without /compressed; KfvoError for a name invalid in ROS 2."""
+def _make_ground_truth(sequence: Sequence) -> GroundTruthMessages | None:
+    """Return the ground truth of a sequence; a problem with it is only logged."""
+    ground_truth, _ = read_ground_truth(sequence)
+    if ground_truth is None:
+        return None
+    messages = GroundTruthMessages(ground_truth, sequence.camera_frame)
+    if messages.left_out:
+        _log.warning('%s: left out %d of %d poses of the ground truth, which are not of the years '
+                     '1970 to 2038, the only ones of ROS', sequence.name, messages.left_out,
+                     len(ground_truth.trajectory))
+    return messages
+
+
+def _read_extrinsics(sequence: Sequence) -> tuple[FixedTransform, ...]:
+    """Return the transforms from the body to the camera; a problem with them is only logged."""
+    try:
+        return sequence.extrinsics()
+    except KfvoError as error:
+        _log.warning('%s: no /tf_static: %s', sequence.name, error)
+        return ()
+
+
+def _raw_topic(name: str) -> str:
+    """Return a requested topic without /compressed; KfvoError for a name invalid in ROS 2."""
     topic = f'/{name.lstrip("/")}'.removesuffix('/compressed')
-    if not _TOPIC.fullmatch(topic):
+    if not is_legal_topic(topic):
         raise KfvoError(f'expected a --topic like /camera/image_raw, came {name!r}')
     return topic
+
+
+def _allowed(topic: str) -> str:
+    """Return the name under which a topic of the source is written."""
+    allowed = legal_topic(topic)
+    if allowed != topic:
+        _log.warning('ROS 2 does not allow the topic %s; it is written as %s', topic, allowed)
+    return allowed

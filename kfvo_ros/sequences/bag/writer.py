@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Writer of rosbag2 recordings in MCAP; every failure is a KfvoError."""
+"""Writer of rosbag2 recordings in MCAP with CRCs; every failure is a KfvoError."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+import mcap.writer
+from mcap.writer import CompressionType
 from rosbags.interfaces import (
     Connection,
     Qos,
@@ -30,7 +32,7 @@ from rosbags.rosbag2 import (
 from rosbags.typesys import Stores, get_typestore
 
 from kfvo_ros.errors import KfvoError, reason_of
-from kfvo_ros.sequences.bag.reader import BAG_SUFFIXES
+from kfvo_ros.sequences.bag.storage import BAG_SUFFIXES
 
 INFINITE = QosTime(9223372036, 854775807)
 """rmw's infinite duration."""
@@ -39,6 +41,56 @@ STREAM = Qos(QosHistory.KEEP_LAST, 10, QosReliability.RELIABLE, QosDurability.VO
 """Quality of service of periodic topics; subscribers of either reliability match."""
 LATCHED = STREAM._replace(depth=1, durability=QosDurability.TRANSIENT_LOCAL)
 """Quality of service of /tf_static: late subscribers receive the last message."""
+
+
+class McapStorage:
+    """The MCAP file of a recording, in the form that rosbags' writer of recordings wants."""
+
+    def __init__(self, path: Path, compression: CompressionMode) -> None:
+        self.path = path / f'{path.name}.mcap'
+        self._file = self.path.open('xb')
+        self._writer = mcap.writer.Writer(self._file, compression=(
+            CompressionType.ZSTD if compression == CompressionMode.STORAGE
+            else CompressionType.NONE))
+        self._writer.start(profile='ros2')
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[int, int] = {}
+
+    def add_msgtype(self, connection: Connection) -> None:
+        """Write the message definition of a connection."""
+        self._schemas[connection.msgtype] = self._writer.register_schema(
+            connection.msgtype, 'ros2msg', connection.msgdef.data.encode())
+
+    def add_connection(self, connection: Connection, offered_qos_profiles: str) -> None:
+        """Write a channel."""
+        self._channels[connection.id] = self._writer.register_channel(
+            connection.topic, 'cdr', self._schemas[connection.msgtype],
+            {'offered_qos_profiles': offered_qos_profiles})
+
+    def write(self, connection: Connection, timestamp: int, data: bytes | memoryview) -> None:
+        """Write a message."""
+        self._writer.add_message(self._channels[connection.id], log_time=timestamp,
+                                 publish_time=timestamp, data=bytes(data))
+
+    def add_metadata(self, name: str, content: dict[str, str]) -> None:
+        """Write a metadata record."""
+        self._writer.add_metadata(name, content)
+
+    def close(self, version: int, metadata: str) -> None:
+        """Write the metadata of the recording and the index."""
+        self.add_metadata('rosbag2', {'serialized_metadata': metadata})
+        self._writer.finish()
+        self._file.close()
+
+    def abort(self) -> None:
+        """Close the file as it is."""
+        self._file.close()
+
+
+class RosbagWriter(Writer):
+    """rosbags' writer of recordings with our MCAP file."""
+
+    STORAGE_PLUGINS = {StoragePlugin.MCAP: McapStorage}
 
 
 class TopicInfo(NamedTuple):
@@ -64,7 +116,8 @@ class BagWriter:
             raise KfvoError(f'{path}: a recording of ROS 2 is a folder that holds a '
                             f'{path.suffix} file; leave {path.suffix} out of its name')
         self.path = path
-        self._writer = Writer(path, version=metadata_version, storage_plugin=StoragePlugin.MCAP)
+        self._writer = RosbagWriter(path, version=metadata_version,
+                                    storage_plugin=StoragePlugin.MCAP)
         if zstd:
             self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
         self._store = get_typestore(Stores.ROS2_JAZZY)
@@ -89,6 +142,13 @@ class BagWriter:
                 self._connections[topic] = self._writer.add_connection(
                     topic, kind, typestore=self._store, offered_qos_profiles=[qos])
             self._writer.write(self._connections[topic], stamp_ns, data)
+
+    def add_metadata(self, name: str, content: dict[str, str]) -> None:
+        """Write an MCAP metadata record, after a message."""
+        with self._writing_errors():
+            storage = self._writer.storage
+            assert isinstance(storage, McapStorage)
+            storage.add_metadata(name, content)
 
     def close(self) -> None:
         """Write the index and metadata.yaml."""

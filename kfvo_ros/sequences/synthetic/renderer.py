@@ -17,11 +17,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from kfvo_ros.camera import Camera
 from kfvo_ros.sequences.synthetic.scene import Scene
-from kfvo_ros.sequences.synthetic.shading import BoxFrameCamera, shade
+from kfvo_ros.sequences.synthetic.shading import BoxFrameCamera, compiled, shade
 
 TILE = 16
 """Boxes are culled per square tile of this side [px]."""
@@ -54,7 +53,7 @@ def render(scene: Scene, camera: Camera, T_world_camera: np.ndarray
     return radiance, depth
 
 
-@njit(cache=True)
+@compiled
 def _rays_in_box_frames(scene: Scene, T_world_camera: np.ndarray, focal: float, cx: float,
                         cy: float) -> tuple[np.ndarray, np.ndarray]:
     """Return rays (K, 3, 3) and origins (K, 3) of BoxFrameCamera.
@@ -83,7 +82,7 @@ def _rays_in_box_frames(scene: Scene, T_world_camera: np.ndarray, focal: float, 
     return rays, origins
 
 
-@njit(cache=True)
+@compiled
 def _project_planes(half_sizes: np.ndarray, rays: np.ndarray, origins: np.ndarray
                     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the fields of _Planes."""
@@ -109,7 +108,7 @@ def _project_planes(half_sizes: np.ndarray, rays: np.ndarray, origins: np.ndarra
     return coefficients, entry_counts, sides
 
 
-@njit(cache=True)
+@compiled
 def _cast_rays(planes: _Planes, hits: np.ndarray, depth: np.ndarray) -> None:
     """Write the hit buffer, 6 * box + side per pixel, and its depth, tile by tile."""
     height, width = depth.shape
@@ -128,7 +127,7 @@ def _cast_rays(planes: _Planes, hits: np.ndarray, depth: np.ndarray) -> None:
                     depth[v, left + u] = 1.0 / inverse_depth[u]
 
 
-@njit(cache=True)
+@compiled
 def _cull_boxes(planes: _Planes, left: int, top: int, visible: np.ndarray) -> int:
     """Write the boxes that a tile may see, without the room; return their number."""
     reach = 0.5 * (TILE - 1)
@@ -150,7 +149,7 @@ def _cull_boxes(planes: _Planes, left: int, top: int, visible: np.ndarray) -> in
     return count
 
 
-@njit(cache=True)
+@compiled
 def _intersect_room(planes: _Planes, left: int, v: int, inverse_depth: np.ndarray,
                     hit: np.ndarray) -> None:
     """Write the walls that a row of a tile hits, and their inverse depths."""
@@ -163,7 +162,7 @@ def _intersect_room(planes: _Planes, left: int, v: int, inverse_depth: np.ndarra
             inverse_depth[u] = max(inverse_depth[u], value)
 
 
-@njit(cache=True)
+@compiled
 def _intersect_box(planes: _Planes, box: int, left: int, v: int, inverse_depth: np.ndarray,
                    hit: np.ndarray, scratch: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
     """Overwrite the hits of a row of a tile where a box is nearer."""
@@ -185,7 +184,7 @@ def _intersect_box(planes: _Planes, box: int, left: int, v: int, inverse_depth: 
         inverse_depth[u] = near[u] if near[u] > far[u] else inverse_depth[u]
 
 
-@njit(cache=True)
+@compiled
 def _along_row(planes: _Planes, box: int, plane: int, left: int, v: int) -> tuple[float, float]:
     """Return the slope of a plane's inverse depth along a row, and its value at `left`."""
     right, down, start = planes.coefficients[box, plane]

@@ -9,12 +9,16 @@ machine.
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from kfvo_ros.sequences.synthetic.scene import TEXTURE_BITS, Scene
+from kfvo_ros.utils.compiler import Compiler
+
+compiled = Compiler(Path(__file__).parent)
+"""Decorator for the functions of the renderer. Fast arithmetic would not repeat to the byte."""
 
 MIP_OFFSETS = np.array([(4 ** (TEXTURE_BITS + 1) - 4 ** (TEXTURE_BITS + 1 - level)) // 3
                         for level in range(TEXTURE_BITS + 1)])
@@ -48,7 +52,7 @@ class BoxFrameCamera(NamedTuple):
     focal: float
 
 
-@njit(cache=True)
+@compiled
 def shade(scene: Scene, camera: BoxFrameCamera, hits: np.ndarray, depth: np.ndarray,
           radiance: np.ndarray) -> None:
     """Write the radiance (H, W) int32 of a hit buffer (H, W) at `depth` (H, W) [m].
@@ -72,7 +76,7 @@ def shade(scene: Scene, camera: BoxFrameCamera, hits: np.ndarray, depth: np.ndar
             left = right
 
 
-@njit(cache=True)
+@compiled
 def _find_samples(scene: Scene, camera: BoxFrameCamera, box: int, side: int, v: int, left: int,
                   right: int, depth: np.ndarray, samples: np.ndarray) -> None:
     """Write texture coordinates u and v, footprint [texel] and irradiance of a run of pixels.
@@ -107,7 +111,7 @@ def _find_samples(scene: Scene, camera: BoxFrameCamera, box: int, side: int, v: 
         samples[3, u] = (AMBIENT + DIFFUSE / (1.0 + squared)) * (1 << RADIANCE_BITS)
 
 
-@njit(cache=True)
+@compiled
 def _sample_trilinear(mipmap: np.ndarray, u: float, v: float, footprint: float) -> float:
     """Return the grey value at (u, v) of a pixel that covers `footprint` texels."""
     level = 0
@@ -121,7 +125,7 @@ def _sample_trilinear(mipmap: np.ndarray, u: float, v: float, footprint: float) 
     return value / 65536.0
 
 
-@njit(cache=True)
+@compiled
 def _sample_bilinear(mipmap: np.ndarray, u: float, v: float, level: int) -> int:
     """Return the grey value << 16 of a mip level at (u, v), in integer arithmetic."""
     bits = TEXTURE_BITS - level
@@ -150,7 +154,7 @@ def simulate_sensor(radiance: np.ndarray, gain: float, noise_key: int) -> np.nda
     return image
 
 
-@njit(cache=True)
+@compiled
 def _expose(radiance: np.ndarray, gain: int, noise_key: np.uint64, image: np.ndarray) -> None:
     """Blur, amplify, add noise, round and clip."""
     height, width = radiance.shape
@@ -167,7 +171,7 @@ def _expose(radiance: np.ndarray, gain: int, noise_key: np.uint64, image: np.nda
             image[v, u] = min(max((blurred * gain + noise + half) >> VALUE_BITS, 0), 255)
 
 
-@njit(cache=True)
+@compiled
 def _pixel_noise(key: np.uint64, pixel: int) -> np.int64:
     """Return the sum of the eight bytes of a pixel's hash, centred: nearly normal."""
     bits = (key + np.uint64(pixel)) * _WEYL
