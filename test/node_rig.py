@@ -23,6 +23,7 @@ from kfvo_ros.camera import Camera
 from kfvo_ros.sequences.base import Frame
 from kfvo_ros.sequences.synthetic.sequence import SyntheticSequence
 from kfvo_ros.trajectory import NANOSECONDS
+from kfvo_ros.utils.process import time_limit
 
 builtin_interfaces = pytest.importorskip('builtin_interfaces.msg')
 diagnostic_msgs = pytest.importorskip('diagnostic_msgs.msg')
@@ -112,6 +113,16 @@ class Rig:
         self._stack = ExitStack()
 
     def __enter__(self) -> Rig:
+        try:
+            self._start()
+        except BaseException:  # then there is no __exit__
+            self._stack.close()
+            print(*self.lines, sep='')
+            raise
+        return self
+
+    def _start(self) -> None:
+        """Start the node and wait until it is ready."""
         self._stack.enter_context(self.listener)
         if not self._late_camera:
             self.start_camera()
@@ -123,7 +134,6 @@ class Rig:
         wait_until(lambda: self.listener.node.count_publishers(ODOMETRY))
         if not self._late_camera:
             self.wait_for_subscriber()
-        return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
                  traceback: TracebackType | None) -> None:
@@ -197,7 +207,7 @@ class Rig:
     def call(self, service: Any, name: str, **request: Any) -> Any:
         """Call a service of the node; return its response."""
         client = self.listener.node.create_client(service, f'/kfvo/{name}')
-        assert client.wait_for_service(10.0)
+        assert client.wait_for_service(time_limit(10.0))
         future = client.call_async(service.Request(**request))
         wait_until(future.done)
         return future.result()
@@ -212,7 +222,7 @@ class Rig:
         began = time.monotonic()
         if self.process.poll() is None:
             self.process.send_signal(sent)
-        self.process.wait(10.0)
+        self.process.wait(time_limit(10.0))
         took = time.monotonic() - began
         self._reader.join()
         return took

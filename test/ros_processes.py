@@ -6,18 +6,19 @@ from __future__ import annotations
 
 import os
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 import pytest
+from command_lines import run_python, started
 
 import kfvo_ros
+from kfvo_ros.utils.process import time_limit
 
 # Set before the first import of a message and the first node: each is read once.
 os.environ.update({
@@ -42,34 +43,29 @@ ENVIRONMENT = environment()
 
 def run_module(module: str, *arguments: object, timeout: float = 30.0,
                **options: Any) -> subprocess.CompletedProcess[str]:
-    """Run ``python -m module`` in the domain until it ends."""
-    return subprocess.run([sys.executable, '-m', module, *map(str, arguments)], text=True,
-                          capture_output=True, env=ENVIRONMENT, timeout=timeout, **options)
+    """Run ``python -m module`` in the domain until it ends; `timeout` [s] is scaled."""
+    return run_python('-m', module, *arguments, env=ENVIRONMENT, timeout_s=timeout, **options)
 
 
 @contextmanager
 def running_module(module: str, *arguments: object, env: dict[str, str] | None = None
                    ) -> Iterator[subprocess.Popen[str]]:
     """Yield ``python -m module`` running in the domain; it does not outlive the ``with``."""
-    process = subprocess.Popen([sys.executable, '-m', module, *map(str, arguments)], text=True,
-                               stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-                               env=env or ENVIRONMENT)
-    try:
-        yield process
-    finally:
-        process.terminate()  # killed, it would leave shared memory behind
+    with started('-m', module, *arguments, env=env or ENVIRONMENT) as process:
         try:
-            process.communicate(timeout=10.0)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.communicate()
+            yield process
+        finally:
+            process.terminate()  # killed, it would leave shared memory behind
+            with suppress(subprocess.TimeoutExpired):
+                process.communicate(timeout=time_limit(10.0))
 
 
 def wait_until(condition: Callable[[], Any], timeout_s: float = 20.0) -> None:
-    """Wait until the condition holds; AssertionError after `timeout_s`."""
-    end = time.monotonic() + timeout_s
+    """Wait until the condition holds; AssertionError after the `time_limit` of `timeout_s`."""
+    limit_s = time_limit(timeout_s)
+    end = time.monotonic() + limit_s
     while not condition():
-        assert time.monotonic() < end, f'not true within {timeout_s} s'
+        assert time.monotonic() < end, f'not true within {limit_s:.0f} s'
         time.sleep(0.02)
 
 

@@ -16,8 +16,8 @@ from typing import Any
 import pytest
 import yaml
 
-from kfvo_ros.camera import read_camera_info
 from kfvo_ros.ros.options import node_parameters
+from kfvo_ros.sequences.calibration import read_camera_info
 from kfvo_ros.sequences.tum import FREIBURG
 from kfvo_ros.utils.files import find_config
 
@@ -66,24 +66,44 @@ class FakeLaunch:
     def __init__(self, *arguments: object, **keywords: object) -> None:
         self.arguments, self.keywords = arguments, keywords
 
-    def perform(self, context: dict[str, str]) -> str:
+    def perform(self, context: Any) -> str:
         """Return the value of a LaunchConfiguration in a context of arguments."""
-        return context[self.arguments[0]]
+        return context.launch_configurations[self.arguments[0]]
+
+
+class PackageNotFoundError(Exception):
+    """Replaces that of ament_index_python."""
 
 
 @pytest.fixture
 def launch_file(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """Return the launch file as a module, with FakeLaunch for the classes of launch."""
-    names = ('Action', 'DeclareLaunchArgument', 'ExecuteProcess', 'OpaqueFunction', 'IfCondition',
+    """Return the launch file as a module, with FakeLaunch for the classes of launch.
+
+    No package is installed, as far as it can see.
+    """
+    def get_package_prefix(name: str) -> str:
+        raise PackageNotFoundError(name)
+
+    names = ('Action', 'DeclareLaunchArgument', 'LogInfo', 'OpaqueFunction', 'Shutdown',
              'LaunchConfiguration', 'Node', 'LaunchContext', 'LaunchDescription')
     classes = {name: type(name, (FakeLaunch,), {}) for name in names}
-    for module in ('launch', 'launch.action', 'launch.actions', 'launch.conditions',
-                   'launch.substitutions', 'launch_ros', 'launch_ros.actions'):
+    for module in ('launch', 'launch.action', 'launch.actions', 'launch.substitutions',
+                   'launch_ros', 'launch_ros.actions'):
         monkeypatch.setitem(sys.modules, module, SimpleNamespace(**classes))
+    packages = SimpleNamespace(get_package_prefix=get_package_prefix,
+                               PackageNotFoundError=PackageNotFoundError)
+    monkeypatch.setitem(sys.modules, 'ament_index_python', SimpleNamespace(packages=packages))
+    monkeypatch.setitem(sys.modules, 'ament_index_python.packages', packages)
     spec = importlib.util.spec_from_file_location('kfvo_launch', LAUNCH)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     yield module
+
+
+def start(launch_file: Any, **given: str) -> list[Any]:
+    """Return the actions for launch arguments; those that are not given are empty."""
+    arguments = dict.fromkeys((*launch_file.PARAMETERS, *launch_file.OTHERS), '') | given
+    return launch_file._start(SimpleNamespace(launch_configurations=arguments))
 
 
 def test_every_parameter_is_a_launch_argument(launch_file: Any) -> None:
@@ -99,29 +119,56 @@ def test_every_parameter_is_a_launch_argument(launch_file: Any) -> None:
 
 
 def test_launch_arguments_reach_the_node_in_their_types(launch_file: Any) -> None:
-    given = dict.fromkeys((*launch_file.PARAMETERS, *launch_file.OTHERS), '')
-    given |= {'preset': 'euroc', 'bag': 'a.bag', 'scale': '2', 'publish_tf': 'False',
-              'window_size': '5', 'keyframes': 'every', 'use_sim_time': 'true'}
-    node, player = launch_file._start(given)
+    node, = start(launch_file, preset='euroc', scale='2', publish_tf='False', window_size='5',
+                  keyframes='every', use_sim_time='true')
     preset, values = node.keywords['parameters']
     assert Path(preset).samefile(ROOT / 'config' / 'euroc.yaml')
     assert values == {'scale': 2.0, 'publish_tf': False, 'window_size': 5, 'keyframes': 'every',
                       'use_sim_time': True}
     assert [type(values[name]) for name in ('scale', 'window_size')] == [float, int]
-    assert player.keywords['cmd'][-2:] == ['a.bag', '--wait-for-subscribers']
+    assert 'on_exit' not in node.keywords
+
+
+@pytest.mark.parametrize(('simulated', 'clock'), [('', []), ('true', ['--clock'])])
+def test_a_bag_is_played_in_full_and_its_end_ends_all(launch_file: Any, tmp_path: Path,
+                                                      simulated: str, clock: list[str]) -> None:
+    node, player = start(launch_file, bag=str(tmp_path), use_sim_time=simulated, preset='kitti')
+    assert node.keywords['parameters'][0] == {'process_every_frame': True}  # a preset may differ
+    assert player.keywords['executable'] == 'kfvo_play'
+    assert player.keywords['arguments'] == [str(tmp_path), *clock, '--wait-for-processing',
+                                            '--wait-for-subscribers']
+    for action in (node, player):
+        assert type(action.keywords['on_exit']).__name__ == 'Shutdown'
+
+
+def test_missing_rviz_is_said_and_the_node_starts(launch_file: Any,
+                                                  monkeypatch: pytest.MonkeyPatch) -> None:
+    node, line = start(launch_file, rviz='true')
+    assert node.keywords['executable'] == 'kfvo_node'
+    assert 'rviz2 is not installed' in line.keywords['msg']
+    monkeypatch.setattr(launch_file, 'get_package_prefix', lambda name: '/opt')
+    node, viewer = start(launch_file, rviz='true')
+    assert viewer.keywords['package'] == 'rviz2' and 'on_exit' not in viewer.keywords
+
+
+def test_a_misspelt_launch_argument_is_named(launch_file: Any) -> None:
+    line, node = start(launch_file, window_sise='5', arm_length='1')
+    assert line.keywords['msg'] == 'unknown launch argument window_sise: is window_size meant?'
 
 
 @pytest.mark.parametrize(('name', 'text', 'expected'), [
     ('window_size', '2', 'a whole number of at least 3 and at most 32'),
     ('keyframes', 'often', 'one of every, optical_flow, survival'),
-    ('publish_tf', 'perhaps', 'true or false'), ('scale', 'nan', 'a number of at least')])
+    ('publish_tf', 'perhaps', 'true or false'), ('scale', 'nan', 'a number of at least'),
+    ('rviz', 'maybe', 'true or false'), ('bag', '/no/such.bag', 'a bag, /no/such.bag does not'),
+    ('preset', 'eurok', 'one of euroc, kitti, tum, or a parameter file'),
+    ('preset', 'train', 'one of euroc, kitti, tum, or a parameter file')])
 def test_an_invalid_launch_argument_is_an_error(launch_file: Any, name: str, text: str,
                                           expected: str) -> None:
-    given = dict.fromkeys((*launch_file.PARAMETERS, *launch_file.OTHERS), '') | {name: text}
     with pytest.raises(RuntimeError) as error:
-        launch_file._start(given)
+        start(launch_file, **{name: text})
     assert f'launch argument {name}: expected {expected}' in str(error.value)
-    assert repr(text) in str(error.value)
+    assert text in str(error.value)
 
 
 def test_documented_parameters_equal_those_of_the_node() -> None:

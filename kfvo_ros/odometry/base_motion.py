@@ -37,6 +37,12 @@ class BaseMotion:
     twist: np.ndarray
     twist_covariance: np.ndarray
 
+    @property
+    def is_finite(self) -> bool:
+        """Whether no number is NaN or infinite."""
+        return all(np.isfinite(values).all() for values in (
+            self.T_odom_base, self.covariance, self.twist, self.twist_covariance))
+
 
 def base_pose(T_world_camera: np.ndarray, T_base_camera: np.ndarray) -> np.ndarray:
     """Return T_odom_base (4, 4) for a camera pose T_world_camera (4, 4)."""

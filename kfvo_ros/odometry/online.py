@@ -4,14 +4,16 @@
 
 from __future__ import annotations
 
+import errno
+import io
+import os
 import shutil
 import tempfile
 from collections import deque
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TextIO
+from typing import IO
 
 import numpy as np
 
@@ -22,12 +24,15 @@ from kfvo_ros.odometry.keyframe_odometry import KeyframeOdometry
 from kfvo_ros.odometry.updates import FramePose
 from kfvo_ros.odometry.window_prior import scale_poses
 from kfvo_ros.sequences.base import Frame
-from kfvo_ros.trajectory import format_tum_line
+from kfvo_ros.trajectory import UNKNOWN_VARIANCE, format_tum_line
+from kfvo_ros.utils.files import atomic_write
 
 SPREAD_MEMORY = 0.05
 """Weight of the newest final pose in the mean square difference of arrival and final poses."""
 MIN_VARIANCE = 1e-8
 """Lower limit of all variances: 0.1 mm and 0.1 mrad, squared."""
+MAX_WAITING = 100_000
+"""Poses that wait in memory for room on the disk: an hour at 30 Hz, 20 MB."""
 StampedPose = tuple[int, np.ndarray]
 """(stamp_ns, T_world_x (4, 4))."""
 
@@ -57,6 +62,8 @@ class OnlineOdometry:
     """Odometry of one uninterrupted segment; `scale` [m per unit] multiplies all output.
 
     Final poses are written to `log` at once; the last `path_length` are kept (None: all).
+    Everything it returns is finite: a frame of which anything is not is LOST, at the last pose
+    that was. ``failed_in_a_row`` counts such frames up to the present one.
     """
 
     def __init__(self, odometry: KeyframeOdometry, log: TrajectoryLog, scale: float = 1.0,
@@ -68,6 +75,8 @@ class OnlineOdometry:
         self._arrivals: deque[np.ndarray] = deque()
         self._spread = np.zeros((6, 6))
         self._last: FramePose | None = None
+        self._last_finite = np.eye(4)
+        self.failed_in_a_row = 0
 
     def process(self, frame: Frame) -> OnlinePose:
         """Estimate the pose of the next frame; raises KfvoError for a frame of another size."""
@@ -81,20 +90,19 @@ class OnlineOdometry:
             motion = self._metric(geometry.relative(previous.T_world_camera,
                                                     update.T_world_camera))
             interval_ns = update.stamp_ns - previous.stamp_ns
-        return OnlinePose(update.stamp_ns, self._metric(update.T_world_camera),
-                          self._metric_covariance(update.covariance), update.status,
-                          update.is_keyframe, motion, interval_ns,
-                          self._metric_covariance(update.window_covariance),
-                          update.intrinsics)
+        return self._finite(OnlinePose(
+            update.stamp_ns, self._metric(update.T_world_camera),
+            self._metric_covariance(update.covariance), update.status, update.is_keyframe, motion,
+            interval_ns, self._metric_covariance(update.window_covariance), update.intrinsics))
 
     def path(self) -> list[StampedPose]:
         """Return (stamp_ns, refined T_world_camera) of the latest frames."""
-        path = [*self._path, *self._stamped(self._odometry.pending)]
+        path = [*self._path, *self._pending()]
         return path if self._path.maxlen is None else path[-self._path.maxlen:]
 
-    def save(self, path: Path) -> int:
-        """Write all poses so far to a new TUM file; return their number. Raises KfvoError."""
-        return self._log.save(path, self._stamped(self._odometry.pending))
+    def save(self, path: Path) -> str:
+        """Write all poses so far to a new TUM file; return a report. Raises KfvoError."""
+        return self._log.save(path, self._pending())
 
     def finish(self) -> None:
         """Write the remaining poses and close the log."""
@@ -103,17 +111,40 @@ class OnlineOdometry:
 
     def _finalise(self, final: Iterable[FramePose]) -> None:
         """Log final poses; update the spread of their differences from the poses at arrival."""
-        poses = self._stamped(final)
-        for _, T_world_camera in poses:
+        poses = []
+        for stamp_ns, T_world_camera in self._stamped(final):
             arrival = self._metric(self._arrivals.popleft())
-            turn = geometry.log_so3(T_world_camera[:3, :3] @ arrival[:3, :3].T)
-            change = np.concatenate([T_world_camera[:3, 3] - arrival[:3, 3], turn])
-            self._spread += SPREAD_MEMORY * (np.outer(change, change) - self._spread)
+            if not _are_finite(T_world_camera):
+                self._log.missing += 1
+                continue
+            poses.append((stamp_ns, T_world_camera))
+            if _are_finite(arrival):
+                turn = geometry.log_so3(T_world_camera[:3, :3] @ arrival[:3, :3].T)
+                change = np.concatenate([T_world_camera[:3, 3] - arrival[:3, 3], turn])
+                self._spread += SPREAD_MEMORY * (np.outer(change, change) - self._spread)
         self._path.extend(poses)
         self._log.append(poses)
 
+    def _pending(self) -> list[StampedPose]:
+        return [pose for pose in self._stamped(self._odometry.pending) if _are_finite(pose[1])]
+
     def _stamped(self, poses: Iterable[FramePose]) -> list[StampedPose]:
         return [(each.stamp_ns, self._metric(each.T_world_camera)) for each in poses]
+
+    def _finite(self, pose: OnlinePose) -> OnlinePose:
+        """Return the pose if all of it is finite, else one of a LOST frame."""
+        motion = pose.T_previous_camera if pose.T_previous_camera is not None else np.eye(4)
+        known = _are_finite(pose.T_world_camera)
+        if known:
+            self._last_finite = pose.T_world_camera
+            if _are_finite(pose.covariance, motion, pose.motion_covariance):
+                self.failed_in_a_row = 0
+                return pose
+        self.failed_in_a_row += 1
+        unknown = UNKNOWN_VARIANCE * np.eye(6)
+        return replace(pose, T_world_camera=self._last_finite, covariance=unknown,
+                       status=Status.LOST, is_keyframe=pose.is_keyframe and known,
+                       T_previous_camera=None, motion_covariance=unknown, intrinsics=None)
 
     def _metric(self, pose: np.ndarray) -> np.ndarray:
         """Return a pose (4, 4) of trajectory units in metres."""
@@ -127,78 +158,147 @@ class OnlineOdometry:
 
 
 class TrajectoryLog:
-    """A new TUM file at `path` (None: an unnamed temporary file) to which poses are appended.
+    """A new TUM file at `path` (None: a temporary one without a name) that grows by poses.
 
-    Raises KfvoError when the file exists already or cannot be created. When a later write fails,
-    ``problem`` holds the error and nothing more is written.
+    Poses that cannot be written, as on a full disk, wait in memory and are written once there is
+    room, the oldest of more than MAX_WAITING excepted. Raises KfvoError when the file exists
+    already or cannot be created; with `deferred` creation is tried again like writing.
     """
 
-    def __init__(self, path: Path | None = None) -> None:
+    def __init__(self, path: Path | None = None, deferred: bool = False) -> None:
         self.path = path
-        self.problem: KfvoError | None = None
-        self._count = 0
-        self._file: TextIO
-        if path is None:
-            self._file = tempfile.TemporaryFile('w+', encoding='ascii')  # noqa: SIM115
-        else:
+        self.missing = 0
+        self._waiting: deque[bytes] = deque()
+        self._error: KfvoError | None = None
+        self._count = self._size = 0
+        self._file: IO[bytes] | None = None
+        if not deferred:
             self._file = _create(path)
 
-    def append(self, poses: Iterable[StampedPose]) -> None:
-        """Append poses and flush them to disk."""
-        if self.problem is None:
-            lines = [format_tum_line(*pose) for pose in poses]
-            with self._writing_errors():
-                self._file.writelines(lines)
-                self._file.flush()
-                self._count += len(lines)
+    @property
+    def problem(self) -> str:
+        """Why poses are not in the file, empty where all are."""
+        if self._error is not None:
+            return f'{self._error}; {len(self._waiting)} poses wait in memory{self._gaps()}'
+        return f'the trajectory {self._name}{self._gaps()}' if self.missing else ''
 
-    def save(self, path: Path, rest: Iterable[StampedPose]) -> int:
-        """Copy the log, and poses that are not final yet, to a new file; return their number."""
-        copy = _create(path)
-        lines = [format_tum_line(*pose) for pose in rest]
+    def append(self, poses: Iterable[StampedPose]) -> None:
+        """Append poses, and those that wait, as far as there is room."""
+        self._waiting.extend(_lines(poses))
         try:
-            with copy:
-                self._file.seek(0)
-                shutil.copyfileobj(self._file, copy)
-                copy.writelines(lines)
-            return self._count + len(lines)
+            if self._file is None:
+                self.path = free_path(self.path) if self.path else None
+                self._file = _create(self.path)
+            while self._waiting:
+                self._write(self._file, self._waiting[0])
+                self._waiting.popleft()
+                self._count += 1
+            self._error = self._deletion()
         except OSError as error:
+            self._error = _unwritable(self.path, error)
+        except KfvoError as error:
+            self._error = error
+        while len(self._waiting) > MAX_WAITING:
+            self._waiting.popleft()
+            self.missing += 1
+
+    def save(self, path: Path, rest: Iterable[StampedPose]) -> str:
+        """Write the log, and poses that are not final yet, to a new file; return a report.
+
+        The file appears when it is complete. Raises KfvoError.
+        """
+        lines = [*self._waiting, *_lines(rest)]
+        try:
+            if os.path.lexists(path):
+                raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST))
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with atomic_write(path) as draft, draft.open('wb') as copy:
+                self._copy_to(copy)
+                copy.writelines(lines)
+                copy.flush()
+                os.fsync(copy.fileno())
+        except (OSError, ValueError) as error:
             raise _unwritable(path, error) from error
-        finally:
-            self._file.seek(0, 2)
+        return f'{self._count + len(lines)} poses written to {path}{self._gaps()}'
 
     def close(self) -> None:
-        """Close the file; an empty one is deleted."""
-        with self._writing_errors():
-            self._file.close()  # flushes, which fails again where the disk is full
-        if self.path is not None and self._count == 0:
-            self.path.unlink(missing_ok=True)
-
-    @contextmanager
-    def _writing_errors(self) -> Iterator[None]:
-        """Store a write error in ``problem``: a full disk must not end the odometry."""
+        """Close the file, after a last attempt to write what waits; an empty one is deleted."""
+        if self._waiting:
+            self.append(())
+        if self._file is None:
+            return
         try:
-            yield
+            self._file.close()  # where network file systems report errors
+            if self.path is not None and self._count == 0:
+                self.path.unlink(missing_ok=True)
         except OSError as error:
-            self.problem = _unwritable(self.path or Path(tempfile.gettempdir()), error)
+            self._error = _unwritable(self.path, error)
+
+    @property
+    def _name(self) -> Path:
+        return self.path or Path(tempfile.gettempdir())
+
+    def _gaps(self) -> str:
+        return f'; {self.missing} poses are missing in it' if self.missing else ''
+
+    def _write(self, file: IO[bytes], line: bytes) -> None:
+        """Write a whole line or nothing; raises OSError."""
+        try:
+            written = 0
+            while written < len(line):
+                written += file.write(line[written:])
+        except OSError:
+            file.truncate(self._size)
+            file.seek(self._size)
+            raise
+        self._size += len(line)
+
+    def _copy_to(self, copy: IO[bytes]) -> None:
+        if self._file is not None:
+            self._file.seek(0)
+            try:
+                shutil.copyfileobj(self._file, copy)
+            finally:
+                self._file.seek(self._size)
+
+    def _deletion(self) -> KfvoError | None:
+        """Return the error of a file that somebody deleted while it grows."""
+        if self.path is None or self._file is None or os.fstat(self._file.fileno()).st_nlink:
+            return None
+        return KfvoError(f'the trajectory {self.path} was deleted; a saved one has all poses')
 
 
 def free_path(path: Path) -> Path:
     """Return `path`, or the first of path-1, path-2 ... that does not exist."""
     candidate, number = path, 0
-    while candidate.exists():
+    while os.path.lexists(candidate):
         number += 1
         candidate = path.with_stem(f'{path.stem}-{number}')
     return candidate
 
 
-def _create(path: Path) -> TextIO:
+def _are_finite(*arrays: np.ndarray) -> bool:
+    return all(np.isfinite(array).all() for array in arrays)
+
+
+def _lines(poses: Iterable[StampedPose]) -> list[bytes]:
+    return [format_tum_line(*pose).encode('ascii') for pose in poses]
+
+
+def _create(path: Path | None) -> IO[bytes]:
+    """Return a new file without a buffer, in which errors of writing would hide."""
+    if path is None:
+        try:
+            return tempfile.TemporaryFile(buffering=0)
+        except OSError:  # no folder for temporary files, as in read-only containers
+            return io.BytesIO()
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        return path.open('x+', encoding='ascii')
-    except OSError as error:
+        return path.open('xb+', buffering=0)
+    except (OSError, ValueError) as error:
         raise _unwritable(path, error) from error
 
 
-def _unwritable(path: Path, error: OSError) -> KfvoError:
-    return KfvoError(f'cannot write the trajectory {path}: {reason_of(error)}')
+def _unwritable(path: Path | None, error: Exception) -> KfvoError:
+    return KfvoError(f'cannot write the trajectory {path or tempfile.gettempdir()}: '
+                     f'{reason_of(error)}')

@@ -19,13 +19,16 @@ from rclpy.node import Node
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.ros.messages import to_stamp_ns
 from kfvo_ros.ros.runtime import spinning_node
+from kfvo_ros.utils.process import time_limit
+from kfvo_ros.utils.signals import sleep
 
 QUIET_S = 1.5
 """Without a new pose for this long the node has processed all images."""
 TIMEOUT_S = 60.0
-"""Longest wait for the node to start, and for it to process all images."""
+"""Longest wait for the node to start, and for it to process all images, on a free machine. It
+suffices for compilation where no cache is writable."""
 STOP_S = 5.0
-"""Longest wait for the node to stop before it is killed."""
+"""Longest wait for the node to stop before it is killed, on a free machine."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +72,7 @@ class NodeListener(Node):
         """Return once no pose has come for `quiet_s`, at the latest after `timeout_s`."""
         end = time.monotonic() + timeout_s
         while time.monotonic() < end and time.monotonic() - self._last_pose < quiet_s:
-            time.sleep(0.1)
+            sleep(0.1)
 
     def _on_odometry(self, message: Odometry) -> None:
         self._last_pose = time.monotonic()
@@ -99,15 +102,16 @@ def run_node(bag: Path, topic: str, parameters: dict[str, object], rate: float =
             [sys.executable, '-m', 'kfvo_ros.node', '--ros-args', *arguments]) as node:
         try:
             _await_node(listener, node)
-            player = subprocess.run(
-                [sys.executable, '-m', 'kfvo_ros.play', str(bag), '--rate', str(rate), '--topic',
-                 topic, '--topic', f'{topic.rpartition("/")[0]}/camera_info',
-                 '--wait-for-subscribers'])
-            listener.wait_until_quiet(QUIET_S, TIMEOUT_S)
+            with subprocess.Popen(
+                    [sys.executable, '-m', 'kfvo_ros.play', str(bag), '--rate', str(rate),
+                     '--topic', topic, '--topic', f'{topic.rpartition("/")[0]}/camera_info',
+                     '--wait-for-subscribers']) as player:
+                _await_player(player)
+            listener.wait_until_quiet(QUIET_S, time_limit(TIMEOUT_S))
         finally:
             node.terminate()
             try:
-                node.wait(STOP_S)
+                node.wait(time_limit(STOP_S))
             except subprocess.TimeoutExpired:
                 node.kill()
     if player.returncode != 0 or node.returncode != 0 or 'images received' not in listener.values:
@@ -118,11 +122,20 @@ def run_node(bag: Path, topic: str, parameters: dict[str, object], rate: float =
 
 def _await_node(listener: NodeListener, node: subprocess.Popen[bytes]) -> None:
     """Return once the node's diagnostics arrive, so that no pose is missed; raises KfvoError."""
-    end = time.monotonic() + TIMEOUT_S
+    end = time.monotonic() + time_limit(TIMEOUT_S)
     while not listener.values:
         if node.poll() is not None or time.monotonic() > end:
             raise KfvoError('kfvo_node does not run; its output is above')
-        time.sleep(0.05)
+        sleep(0.05)
+
+
+def _await_player(player: subprocess.Popen[bytes]) -> None:
+    """Return once the player has ended; end it after a signal."""
+    try:
+        while player.poll() is None:
+            sleep(0.05)
+    finally:
+        player.terminate()
 
 
 def _collect(listener: NodeListener) -> NodeRun:

@@ -19,8 +19,7 @@ class NodeOptions:
     """What kfvo_node subscribes to and publishes."""
 
     image_topic: str = option(
-        'image', 'images to follow; remapping image does the same. Ends in /compressed for '
-        'sensor_msgs/CompressedImage')
+        'image', 'images to follow, Image or CompressedImage; remapping image does the same')
     image_qos: str = option(
         'auto', "reliability of the subscription; auto follows the publisher's",
         ('auto', 'reliable', 'best_effort'))
@@ -68,6 +67,8 @@ class PlayOptions:
         None, 'start when the image topic has this many subscribers (without images: each '
         'topic); '
         '1 without a value', least=1, bare=1)
+    wait_for_processing: bool = option(
+        False, 'at the end wait until the running kfvo_node has processed all images')
 
 
 PARAMETERS = (NodeOptions, OdometryOptions, VggtOptions)

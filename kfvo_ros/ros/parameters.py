@@ -5,14 +5,18 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
 
-from kfvo_ros.errors import KfvoError
+from kfvo_ros.errors import KfvoError, printable
 from kfvo_ros.utils.config import Option, options_of
+from kfvo_ros.utils.files import read_yaml
 
 RCLPY_PARAMETERS = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')
 """Prefixes of the parameters that rclpy declares itself."""
@@ -22,19 +26,53 @@ MOST = {int: 2 ** 63 - 1, float: 1e308}
 def read_parameters(node: Node, *kinds: type[Any]) -> list[Any]:
     """Declare the fields of options dataclasses as parameters of `node` and return the options.
 
-    The node must have been made with ``automatically_declare_parameters_from_overrides``; a
-    parameter that it was given and no dataclass declares is a warning. Raises KfvoError for a
-    value of the wrong type or out of range.
+    A parameter that the node was given and no dataclass declares is a warning. Raises KfvoError
+    for a value of the wrong type or out of range.
     """
-    options = [kind(**{declared.name: _read(node, declared) for declared in options_of(kind)})
-               for kind in kinds]
-    _warn_of_unknown(node, [declared.name for kind in kinds for declared in options_of(kind)])
-    return options
+    # rclpy can declare what the node was given itself, but not an empty list.
+    given = {name: parameter.value for name, parameter in node._parameter_overrides.items()}
+    _warn_of_unknown(node, given, [each.name for kind in kinds for each in options_of(kind)])
+    return [kind(**{each.name: _read(node, each, given) for each in options_of(kind)})
+            for kind in kinds]
 
 
-def _warn_of_unknown(node: Node, known: Iterable[str]) -> None:
+def warn_of_ignored_files(node: Node, arguments: list[str]) -> None:
+    """Log a warning for each parameter file in ROS arguments that has nothing for this node."""
+    name = node.get_fully_qualified_name()
+    for flag, file in pairwise(arguments):
+        if flag != '--params-file':
+            continue
+        try:
+            sections = dict(_sections(read_yaml(Path(file))))
+        except KfvoError:  # rcl reads more than this does, or has refused the file
+            continue
+        if sections and not any(_matches(key, name) for key in sections):
+            keys = '; '.join(f'{", ".join(parameters) or "nothing"} of {key}'
+                             for key, parameters in sections.items())
+            node.get_logger().warning(
+                f'{file} has no parameters of {name}, so it is ignored: {printable(keys)}. Write '
+                f'them below {name} or /**')
+
+
+def _sections(document: Any, parent: str = '') -> Iterator[tuple[str, list[str]]]:
+    """Yield the names of nodes in a parameter file, with the names of their parameters."""
+    for key, value in document.items() if isinstance(document, dict) else ():
+        if key == 'ros__parameters':
+            yield parent or '/', list(map(str, value)) if isinstance(value, dict) else []
+        else:
+            yield from _sections(value, f'{parent}/{str(key).strip("/")}')
+
+
+def _matches(key: str, name: str) -> bool:
+    """Return whether a key of a parameter file, which may have * and **, names a node."""
+    words = (re.escape(word).replace(r'\*\*', '.*').replace(r'\*', '[^/]+')
+             for word in key.split('/'))
+    return re.fullmatch('/'.join(words).replace('/.*', '(/.*)?'), name) is not None
+
+
+def _warn_of_unknown(node: Node, given: Iterable[str], known: Iterable[str]) -> None:
     """Log a warning for each parameter that is neither known nor rclpy's own."""
-    for name in node.get_parameters_by_prefix(''):
+    for name in given:
         if name not in known and not name.startswith(RCLPY_PARAMETERS):
             similar = difflib.get_close_matches(name, known, 1)
             node.get_logger().warning(
@@ -43,18 +81,19 @@ def _warn_of_unknown(node: Node, known: Iterable[str]) -> None:
                    f'expected one of {", ".join(known)}'))
 
 
-def _read(node: Node, declared: Option) -> Any:
+def _read(node: Node, declared: Option, given: Mapping[str, Any]) -> Any:
     """Return the value of one parameter; declare it with its description and range."""
     # A parameter cannot be None: an empty text stands for it.
     value = '' if declared.default is None else declared.default
-    if node.has_parameter(declared.name):
-        value = node.get_parameter(declared.name).value
-        if not (declared.may_be_none and value == ''):
-            try:
+    if declared.name in given:
+        value = given[declared.name]
+        try:
+            if value is None:
+                raise ValueError(f'expected {declared.expected}, came an empty list')
+            if not (declared.may_be_none and value == ''):
                 value = declared.check(value)
-            except ValueError as error:
-                raise KfvoError(f'parameter {declared.name}: {error}') from error
-        node.undeclare_parameter(declared.name)
+        except ValueError as error:
+            raise KfvoError(f'parameter {declared.name}: {error}') from error
     node.declare_parameter(declared.name, value, _descriptor(declared), ignore_override=True)
     return None if declared.may_be_none and value == '' else value
 

@@ -8,21 +8,24 @@ import logging
 import time
 from collections.abc import Callable, Iterable
 from itertools import count
+from typing import Any, NamedTuple
 
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.duration import Duration
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
-from tqdm import tqdm
 
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.ros.messages import find_message_class, wire_format
 from kfvo_ros.ros.options import PlayOptions
 from kfvo_ros.ros.worker import ReadAhead
-from kfvo_ros.sequences.bag.reader import Bag
+from kfvo_ros.sequences.bag.reader import COMPRESSED_IMAGE, IMAGE, Bag
 from kfvo_ros.trajectory import NANOSECONDS
+from kfvo_ros.utils.progress import progress_bar
+from kfvo_ros.utils.signals import raise_if_interrupted, sleep
 
 READ_AHEAD_BYTES = 16 * 1024 * 1024
 DISCOVERY_S = 3.5
@@ -33,6 +36,8 @@ REMINDER_S = 5.0
 """Period of the log line about missing subscribers."""
 ACKNOWLEDGEMENT_S = 5.0
 """Time for subscribers to confirm the last messages: Fast DDS asks every 3 s."""
+REPORT_S = 10.0
+"""Time within which a running kfvo_node reports its state, which it does each second."""
 DEPTH = 10
 """Queue depth of topics that are not latched, whatever was recorded: where a message was lost, a
 deeper queue of Fast DDS delays all later ones by seconds to send it again."""
@@ -43,6 +48,14 @@ LOOP_GAP_S = 0.1
 """Pause between loops, so that a bag of one message does not flood its topic."""
 BAR = '{desc}: {percentage:3.0f}%|{bar}| {n:.1f}/{total:.1f} s of the bag'
 _log = logging.getLogger(__name__)
+
+
+class _Report(NamedTuple):
+    """What a kfvo_node reports: images received, for how many reports it is idle, and when."""
+
+    received: str
+    idle: int
+    arrival_s: float
 
 
 class PlaybackClock:
@@ -76,7 +89,7 @@ class PlaybackClock:
                 wake_ns = min(due_ns, self._next_tick_ns)
             if now_ns >= due_ns:
                 return now_ns - due_ns
-            time.sleep(max(wake_ns - now_ns, 0) / NANOSECONDS)
+            sleep(max(wake_ns - now_ns, 0) / NANOSECONDS)
 
 
 def make_node() -> Node:
@@ -101,6 +114,9 @@ class Player:
         else:
             self._clock_publisher = node.create_publisher(Clock, '/clock', 10)
             self._playback_clock = PlaybackClock(options.rate, self._publish_clock, options.clock)
+        self._reports: dict[str, _Report] = {}
+        if options.wait_for_processing:
+            node.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 10)
         self._max_lateness_ns = 0
         self.published, self.position_s = 0, 0.0
 
@@ -109,19 +125,21 @@ class Player:
         self._await_subscribers()
         name = self._bag.path.name
         try:
-            with tqdm(total=(self._stop_ns - self._start_ns) / NANOSECONDS, desc=name,
-                      bar_format=BAR) as bar:
+            with progress_bar((self._stop_ns - self._start_ns) / NANOSECONDS, 's', name,
+                              bar_format=BAR) as bar:
                 self._play_once(bar)
                 for loop in count(2) if self._options.loop else ():
-                    time.sleep(LOOP_GAP_S)
+                    sleep(LOOP_GAP_S)
                     bar.reset()
                     bar.set_description(f'{name}, loop {loop}')
                     self._play_once(bar)
         finally:
             self._log_lateness()
         self._await_acknowledgements()
+        if self._options.wait_for_processing:
+            self._await_processing()
 
-    def _play_once(self, bar: tqdm) -> None:
+    def _play_once(self, bar: Any) -> None:
         """Publish all selected messages; raises KfvoError when there are none."""
         started = False
         messages = self._bag.raw_messages(self._publishers, self._start_ns, self._stop_ns)
@@ -147,7 +165,8 @@ class Player:
 
     def _await_subscribers(self) -> None:
         """Wait for the required number of subscribers, or briefly for those that run already."""
-        wanted, images = self._options.wait_for_subscribers, set(self._bag.image_topics())
+        wanted = self._options.wait_for_subscribers
+        images = self._bag.topics_of_type(IMAGE, COMPRESSED_IMAGE)
         awaited = {topic: publisher for topic, publisher in self._publishers.items()
                    if topic in images} or self._publishers
         began = reminded = time.monotonic()
@@ -161,18 +180,38 @@ class Player:
                 reminded = now
                 _log.info('waiting for %s on %s', 'a subscriber' if wanted == 1 else
                           f'{wanted} subscribers', ', '.join(missing))
-            time.sleep(0.02)
-        time.sleep(SETTLING_S)
+            sleep(0.02)
+        sleep(SETTLING_S)
 
     def _await_acknowledgements(self) -> None:
         """Wait a limited time until reliable subscribers confirm the last messages."""
         end = time.monotonic() + ACKNOWLEDGEMENT_S
         for publisher in self._publishers.values():
             while not publisher.wait_for_all_acked(Duration(seconds=0.05)):
+                raise_if_interrupted()
                 if time.monotonic() > end:
                     _log.warning('a subscriber of %s did not confirm the last messages',
                                  publisher.topic_name)
                     return
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        """Count the reports of each kfvo_node in a row in which it has nothing to do."""
+        for status in message.status:
+            values = {value.key: value.value for value in status.values}
+            if 'images waiting' in values:
+                received, last = values['images received'], self._reports.get(status.name)
+                idle = values['images waiting'] == '0' and last and last.received == received
+                self._reports[status.name] = _Report(
+                    received, last.idle + 1 if idle and last else 0, time.monotonic())
+
+    def _await_processing(self) -> None:
+        """Wait until every node that reports has been idle since the last message."""
+        self._reports.clear()
+        end = time.monotonic() + REPORT_S
+        while (time.monotonic() < end and not self._reports) or any(
+                report.idle < 2 and time.monotonic() - report.arrival_s < REPORT_S
+                for report in list(self._reports.values())):
+            sleep(0.1)
 
     def _log_lateness(self) -> None:
         if self._max_lateness_ns > LATENESS_LIMIT_NS:

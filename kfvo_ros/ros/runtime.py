@@ -19,6 +19,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
 from kfvo_ros.errors import KfvoError, reason_of
+from kfvo_ros.ros.parameters import warn_of_ignored_files
 
 AnyNode = TypeVar('AnyNode', bound=Node)
 
@@ -42,6 +43,7 @@ def spinning_node(make_node: Callable[[], AnyNode], arguments: list[str]) -> Ite
     try:
         with _ros_errors():
             node = make_node()
+            warn_of_ignored_files(node, arguments)
         executor = SingleThreadedExecutor()
         executor.add_node(node)
         thread = threading.Thread(target=_spin, args=[executor, node.get_logger()],

@@ -25,7 +25,7 @@ class Worker:
         self._size = size
         self._items: deque[Any] = deque()
         self._changed = threading.Condition()
-        self._stopping = False
+        self._stopping = self._is_busy = False
         self._thread = threading.Thread(target=self._run, name='odometry', daemon=True)
 
     def start(self) -> None:
@@ -41,6 +41,12 @@ class Worker:
                 self._items.popleft()
             self._changed.notify()
         return dropped
+
+    @property
+    def waiting(self) -> int:
+        """Number of items that wait or are in work."""
+        with self._changed:
+            return len(self._items) + self._is_busy
 
     def stop(self) -> None:
         """Drop the waiting items and return once the item in work is finished."""
@@ -58,6 +64,7 @@ class Worker:
                 if self._stopping:
                     return
                 item = self._items.popleft() if self._items else None
+                self._is_busy = item is not None
             if item is None:
                 self._idle()
             else:

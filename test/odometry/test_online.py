@@ -5,6 +5,9 @@
 from __future__ import annotations
 
 import resource
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -13,6 +16,7 @@ import pytest
 from kfvo_ros import geometry
 from kfvo_ros.backbones.base import Status
 from kfvo_ros.errors import KfvoError
+from kfvo_ros.odometry import online as module
 from kfvo_ros.odometry.factory import make_odometry
 from kfvo_ros.odometry.online import (
     MIN_VARIANCE,
@@ -25,7 +29,7 @@ from kfvo_ros.odometry.options import OdometryOptions
 from kfvo_ros.odometry.updates import FramePose, Keyframe, Update
 from kfvo_ros.sequences.base import Frame
 from kfvo_ros.sequences.synthetic.sequence import SyntheticSequence
-from kfvo_ros.trajectory import read_tum
+from kfvo_ros.trajectory import UNKNOWN_VARIANCE, read_tum
 
 COUNT = 30
 POSES = [geometry.make_transform(geometry.exp_so3(np.array([0.3, -1.2, 0.5]) * index),
@@ -42,7 +46,8 @@ def test_log_grows_on_disk_and_is_saved_with_pending_poses(tmp_path):
     log = TrajectoryLog(tmp_path / 'new' / 'walk.tum')
     log.append([(1, POSES[0]), (2, POSES[1])])
     assert list(read_tum(log.path).stamps_ns) == [1, 2]
-    assert log.save(tmp_path / 'copy.tum', [(3, POSES[2])]) == 3
+    report = log.save(tmp_path / 'copy.tum', [(3, POSES[2])])
+    assert report == f'3 poses written to {tmp_path / "copy.tum"}'
     log.append([(4, POSES[0])])  # appended at the end, also after a copy
     log.close()
     assert list(read_tum(log.path).stamps_ns) == [1, 2, 4]
@@ -67,19 +72,75 @@ def test_log_never_overwrites_and_deletes_an_empty_file(tmp_path):
     assert free_path(taken) == tmp_path / 'walk-2.tum'
 
 
-def test_log_survives_a_full_disk(tmp_path):
-    """A limit on file sizes simulates it: writing fails in the same place."""
-    log = TrajectoryLog(tmp_path / 'walk.tum')
+@contextmanager
+def full_disk(size: int) -> Iterator[None]:
+    """Let files grow to `size` bytes: writing fails in the same place as on a full disk."""
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100, limits[1]))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
     try:
-        for stamp in range(1, 4):
-            log.append([(stamp, POSES[0])])
-        log.close()
+        yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert str(log.problem) == (f'cannot write the trajectory {tmp_path / "walk.tum"}: '
-                                'File too large')
+
+
+def test_log_continues_without_a_gap_when_there_is_room_again(tmp_path):
+    log = TrajectoryLog(tmp_path / 'walk.tum')
+    with full_disk(100):
+        for stamp in range(1, 4):
+            log.append([(stamp, POSES[0])])
+        assert log.problem == (f'cannot write the trajectory {log.path}: File too large; '
+                               '2 poses wait in memory')
+        assert list(read_tum(log.path).stamps_ns) == [1]  # no half line
+        with pytest.raises(KfvoError, match='cannot write the trajectory .*copy.tum: File too'):
+            log.save(tmp_path / 'copy.tum', [])
+        assert list(tmp_path.iterdir()) == [log.path]
+    assert log.save(tmp_path / 'copy.tum', [(4, POSES[1])]).startswith('4 poses written to ')
+    assert list(read_tum(tmp_path / 'copy.tum').stamps_ns) == [1, 2, 3, 4]
+    log.append([(4, POSES[1])])
+    assert log.problem == ''
+    log.close()
+    assert list(read_tum(log.path).stamps_ns) == [1, 2, 3, 4]
+
+
+def test_log_reports_the_poses_that_neither_disk_nor_memory_holds(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, 'MAX_WAITING', 3)
+    log = TrajectoryLog(tmp_path / 'walk.tum')
+    with full_disk(100):
+        log.append([(stamp, POSES[0]) for stamp in range(1, 7)])
+        assert log.problem.endswith('3 poses wait in memory; 2 poses are missing in it')
+    report = log.save(tmp_path / 'copy.tum', [])
+    assert report == f'4 poses written to {tmp_path / "copy.tum"}; 2 poses are missing in it'
+    log.close()
+    assert log.problem == f'the trajectory {log.path}; 2 poses are missing in it'
+    assert list(read_tum(log.path).stamps_ns) == [1, 4, 5, 6]
+
+
+def test_log_in_a_folder_that_cannot_be_made_is_created_later(tmp_path):
+    taken = tmp_path / 'out'
+    taken.touch()
+    log = TrajectoryLog(taken / 'walk.tum', deferred=True)
+    log.append([(1, POSES[0])])
+    assert log.problem == (f'cannot write the trajectory {taken / "walk.tum"}: File exists; '
+                           '1 poses wait in memory')
+    taken.unlink()
+    log.append([(2, POSES[1])])
+    assert log.problem == '' and list(read_tum(log.path).stamps_ns) == [1, 2]
+    log.path.unlink()
+    log.append([(3, POSES[2])])
+    assert 'was deleted' in log.problem
+    assert log.save(log.path, []).startswith('3 poses written')
+    TrajectoryLog(tmp_path / 'never', deferred=True).close()
+    assert not (tmp_path / 'never').exists()
+
+
+def test_log_without_a_folder_for_temporary_files_is_in_memory(tmp_path, monkeypatch):
+    monkeypatch.setattr(module.tempfile, 'tempdir', str(tmp_path / 'missing'))
+    log = TrajectoryLog()
+    log.append([(1, POSES[0])])
+    log.save(tmp_path / 'copy.tum', [(2, POSES[1])])
+    log.append([(3, POSES[2])])
+    assert log.save(tmp_path / 'all.tum', []).startswith('2 poses')
+    assert list(read_tum(tmp_path / 'copy.tum').stamps_ns) == [1, 2]
 
 
 def test_path_is_the_latest_poses_in_metres():
@@ -143,3 +204,41 @@ def test_the_spread_between_windows_is_in_world_axes():
     np.testing.assert_allclose(variances, SPREAD_MEMORY * np.array([0.04, 0, 0, 0, 0, 0.01]),
                                atol=1e-12)
     assert pose.covariance[0, 5] == pytest.approx(SPREAD_MEMORY * 0.2 * 0.1)
+
+
+@pytest.mark.parametrize('broken', ['T_world_camera', 'covariance', 'window_covariance'])
+def test_a_frame_without_a_finite_pose_is_lost_at_the_last_one(broken, tmp_path):
+    """Nothing that is not finite reaches poses, motions, path or files."""
+    odometry = make_odometry(OdometryOptions())
+    process = odometry.process
+
+    def process_badly(frame: Frame) -> Update:
+        update = process(frame)
+        if frame.stamp_ns not in bad:
+            return update
+        if broken == 'T_world_camera':
+            odometry._newest.T_world_camera = np.full((4, 4), np.nan)
+        return replace(update, **{broken: np.full(np.shape(getattr(update, broken)), np.nan)})
+
+    odometry.process = process_badly
+    frames = rendered_frames()[:12]
+    bad = {frame.stamp_ns for frame in frames[4:6]}
+    online = OnlineOdometry(odometry, TrajectoryLog(tmp_path / 'walk.tum'))
+    poses = []
+    for frame in frames[:6]:
+        poses.append(online.process(frame))
+        assert online.failed_in_a_row == (0, 0, 0, 0, 1, 2)[len(poses) - 1]
+        assert all(np.isfinite(pose).all() for _, pose in online.path())
+    assert [pose.status for pose in poses] == [Status.OK] * 4 + [Status.LOST] * 2
+    for pose in poses[4:]:
+        assert pose.T_previous_camera is None
+        np.testing.assert_array_equal(pose.covariance, UNKNOWN_VARIANCE * np.eye(6))
+        np.testing.assert_array_equal(pose.motion_covariance, UNKNOWN_VARIANCE * np.eye(6))
+        assert np.isfinite(pose.T_world_camera).all()
+    if broken == 'T_world_camera':
+        np.testing.assert_array_equal(poses[5].T_world_camera, poses[3].T_world_camera)
+    online.finish()
+    assert np.isfinite(read_tum(tmp_path / 'walk.tum').poses).all()
+    missing = 1 if broken == 'T_world_camera' else 0  # the other was refined
+    assert online._log.missing == missing
+    assert len(read_tum(tmp_path / 'walk.tum')) == 6 - missing

@@ -36,23 +36,59 @@ def test_rates_and_latencies(monkeypatch):
     assert (values()['input rate [Hz]'], values()['output rate [Hz]']) == ('0.0', '0.0')
 
 
+def level_and_summary(diagnostics: module.Diagnostics) -> tuple[int, str]:
+    status, = diagnostics.message(make_header(1, ''), 'name', '/image', {}).status
+    return int.from_bytes(status.level, 'little'), status.message
+
+
 def test_level_and_summary(monkeypatch):
     diagnostics = module.Diagnostics()
-
-    def level_and_summary() -> tuple[int, str]:
-        status, = diagnostics.message(make_header(1, ''), 'name', '/image', {}).status
-        return int.from_bytes(status.level, 'little'), status.message
-
-    assert level_and_summary() == (0, 'waiting for the first image')
+    assert level_and_summary(diagnostics) == (0, 'waiting for the first image')
     diagnostics.record_pose(diagnostics.record_image(), Status.OK, True)
-    assert level_and_summary() == (0, 'tracking')
-    diagnostics.problem = 'garbage'
-    assert level_and_summary() == (1, 'garbage')
+    assert level_and_summary(diagnostics) == (0, 'tracking')
+    diagnostics.record_refusal('garbage')
+    assert level_and_summary(diagnostics) == (1, 'garbage')
+    diagnostics.record_withheld(Status.OK, 'no TF')
+    assert level_and_summary(diagnostics) == (1, 'no TF')
+    diagnostics.set_problem('log', 'full disk')
+    assert level_and_summary(diagnostics) == (1, 'no TF; full disk')
     diagnostics.record_pose(diagnostics.record_image(), Status.LOST, False)
-    assert level_and_summary() == (1, 'lost')
-    assert (diagnostics.received, diagnostics.processed) == (2, 2)
+    assert level_and_summary(diagnostics) == (1, 'full disk; lost')
+    counted = (diagnostics.received, diagnostics.processed, diagnostics.withheld)
+    assert counted == (2, 2, 1)
     assert (diagnostics.keyframes, diagnostics.frames_lost) == (1, 1)
+    diagnostics.set_problem('log', '')
     monkeypatch.setattr(module, 'IMAGE_TIMEOUT_S', -1.0)
-    assert level_and_summary() == (1, 'no image on /image for 0 s')
+    assert level_and_summary(diagnostics) == (1, 'no image on /image for 0 s; lost')
+    monkeypatch.setattr(module, 'SILENCE_S', -1.0)
+    assert level_and_summary(diagnostics) == (2, 'no image on /image for 0 s; lost')
     diagnostics.paused = True
-    assert level_and_summary() == (0, 'paused')
+    assert level_and_summary(diagnostics) == (0, 'paused')
+
+
+def test_poses_that_are_not_published_are_no_output():
+    diagnostics = module.Diagnostics()
+    for _ in range(5):
+        diagnostics.record_image()
+        diagnostics.record_withheld(Status.OK, 'no transform')
+    status, = diagnostics.message(make_header(1, ''), 'name', '/image', {}).status
+    values = {pair.key: pair.value for pair in status.values}
+    assert (values['images received'], values['images processed']) == ('5', '0')
+    assert (values['poses withheld'], values['output rate [Hz]']) == ('5', '0.0')
+    assert (values['keyframes'], values['state']) == ('0', 'waiting')
+
+
+def test_resets_that_repeat_are_a_warning(monkeypatch):
+    now = 100.0
+    monkeypatch.setattr(module, 'time', SimpleNamespace(monotonic=lambda: now))
+    diagnostics = module.Diagnostics()
+    diagnostics.record_image()
+    for requested in (False, True, True, False):
+        diagnostics.record_reset(requested)
+    assert level_and_summary(diagnostics)[0] == 0
+    diagnostics.record_reset(requested=False)
+    assert level_and_summary(diagnostics) == (1, '3 resets within 60 s')
+    assert diagnostics.resets == 5
+    now += 61.0
+    diagnostics.record_image()
+    assert level_and_summary(diagnostics)[0] == 0

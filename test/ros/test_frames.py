@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+from dataclasses import replace
 from math import cos, pi, sin
 from pathlib import Path
 from types import ModuleType
@@ -16,13 +17,16 @@ from node_rig import DIAGNOSTICS, Rig, make_frames, stamp_ns, to_pose
 from ros_processes import Listener, environment, wait_until
 
 from kfvo_ros import geometry
+from kfvo_ros.backbones.base import Status
+from kfvo_ros.errors import KfvoError
 from kfvo_ros.odometry.base_motion import base_motion
 from kfvo_ros.odometry.factory import make_odometry
-from kfvo_ros.odometry.online import OnlineOdometry, TrajectoryLog
+from kfvo_ros.odometry.online import OnlineOdometry, OnlinePose, TrajectoryLog
 from kfvo_ros.odometry.options import OdometryOptions
 from kfvo_ros.ros import frames as module
 from kfvo_ros.ros.messages import make_transform_message, to_transform
 from kfvo_ros.ros.options import NodeOptions
+from kfvo_ros.ros.publishers import Publishers
 from kfvo_ros.trajectory import NANOSECONDS
 
 geometry_msgs = pytest.importorskip('geometry_msgs.msg')
@@ -104,7 +108,7 @@ def test_node_publishes_nothing_until_tf_is_known_and_then_the_base(tf2_ros):
     with tf, Rig(env=environment(FAKE_TF2), base_frame='base_link') as rig:
         rig.send(FRAMES[:4])
         rig.wait_for_line('no transform from base_link to lens')
-        rig.wait_for_value('images processed', 4)
+        rig.wait_for_value('poses withheld', 4)
         assert not rig.odometry() and not tf.messages(tf2_ros.TOPIC)
         broadcaster = tf2_ros.TransformBroadcaster(tf.node)
         for edge in make_tree():
@@ -137,3 +141,76 @@ def test_node_publishes_nothing_until_tf_is_known_and_then_the_base(tf2_ros):
         assert (transform.header, transform.child_frame_id) == (message.header, 'base_link')
         np.testing.assert_allclose(to_transform(transform), pose, atol=1e-12)
     assert np.abs(expected[-1].T_odom_base - np.eye(4)).max() > 0.01
+
+
+class FakeBuffer:
+    """A TF buffer with T_base_camera by camera frame."""
+
+    def __init__(self, transforms: dict[str, np.ndarray]) -> None:
+        self.transforms = transforms
+
+    def lookup_transform(self, base: str, camera: str, time: Time):
+        if camera not in self.transforms:
+            raise module.tf2_ros.TransformException(camera)
+        return make_transform_message(0, base, camera, self.transforms[camera])
+
+
+def make_pose(stamp_ns: int) -> OnlinePose:
+    return OnlinePose(stamp_ns, np.eye(4), np.eye(6), Status.OK, True, None, 0, np.eye(6))
+
+
+def test_transform_is_that_of_the_camera_and_of_the_segment(tf2_ros):
+    """A mount that moves during a segment is a problem; the next segment looks again."""
+    shifted = T_BASE_LENS + np.outer([0.1, 0.0, 0.0, 0.0], [0, 0, 0, 1])
+    with Listener({}) as listener:
+        publishers = Publishers(listener.node, NodeOptions(base_frame='base_link'))
+        tree = publishers._base._buffer = FakeBuffer({'left': T_BASE_LENS})
+        assert publishers.publish(make_pose(1), 'right').startswith('no transform from base_link')
+        assert publishers.publish(make_pose(2), 'left') == ''
+        np.testing.assert_allclose(publishers._T_base_camera, T_BASE_LENS, atol=1e-12)
+        tree.transforms['right'] = shifted
+        assert publishers.publish(make_pose(3), 'right') == publishers.problem == ''
+        np.testing.assert_allclose(publishers._T_base_camera, shifted, atol=1e-12)
+        tree.transforms['right'] = T_BASE_LENS
+        assert publishers.publish(make_pose(4), 'right') == ''
+        assert publishers.problem.startswith('right moves on base_link, so the poses')
+        np.testing.assert_allclose(publishers._T_base_camera, shifted, atol=1e-12)
+        publishers.start_segment()
+        assert publishers.publish(make_pose(5), 'right') == publishers.problem == ''
+        np.testing.assert_allclose(publishers._T_base_camera, T_BASE_LENS, atol=1e-12)
+        tree.transforms['right'] = np.full((4, 4), np.nan)
+        publishers.start_segment()
+        assert publishers.publish(make_pose(6), 'right').startswith('no transform')
+
+
+def test_poses_that_are_not_finite_are_not_published():
+    with Listener({}) as listener:
+        publishers = Publishers(listener.node, NodeOptions(publish_tf=False))
+        endless = replace(make_pose(1), covariance=np.full((6, 6), np.inf))
+        assert publishers.publish(endless, 'lens') == 'the pose of lens_body is not finite'
+        assert publishers.publish(make_pose(2), 'lens') == ''
+        with pytest.raises(KfvoError, match='images are in odom and poses in odom'):
+            publishers.publish(make_pose(3), 'odom')
+
+
+@pytest.mark.parametrize(('given', 'names', 'line'), [
+    ({}, ('odom', '', ''), None),
+    ({'odom_frame': '/odom', 'base_frame': 'base_link'}, ('odom', 'base_link', ''),
+     "odom_frame: frames of TF have no leading slash: '/odom' is used as odom"),
+    ({'camera_frame': '//lens'}, ('odom', '', 'lens'), "'//lens' is used as lens"),
+    ({'base_frame': 'lens', 'camera_frame': 'lens'}, ('odom', 'lens', 'lens'), 'optical frame')])
+def test_frame_names_are_those_of_tf(given, names, line):
+    lines: list[str] = []
+    checked = module.check_frames(NodeOptions(**given), lines.append)
+    assert (checked.odom_frame, checked.base_frame, checked.camera_frame) == names
+    assert [line in each for each in lines] == ([True] if line else [])
+
+
+@pytest.mark.parametrize(('given', 'problem'), [
+    ({'odom_frame': ''}, "parameter odom_frame: expected the name of a frame, came ''"),
+    ({'base_frame': '/'}, "parameter base_frame: expected the name of a frame, came '/'"),
+    ({'base_frame': '/odom'}, 'odom_frame and base_frame: expected two frames, both are odom'),
+    ({'camera_frame': 'odom'}, 'odom_frame and camera_frame: expected two frames')])
+def test_impossible_frame_names_are_errors(given, problem):
+    with pytest.raises(KfvoError, match=problem):
+        module.check_frames(NodeOptions(**given), lambda line: None)

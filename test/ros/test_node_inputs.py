@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from node_rig import (
     BEST_EFFORT,
+    DIAGNOSTICS,
     HEIGHT,
     IMAGE,
     INFO,
@@ -20,6 +21,7 @@ from node_rig import (
     Rig,
     is_origin,
     make_frames,
+    rosgraph_msgs,
     sensor_msgs,
     stamp_ns,
     stamped,
@@ -27,14 +29,15 @@ from node_rig import (
     to_info,
     to_pose,
 )
-from ros_processes import wait_until
+from ros_processes import Listener, wait_until
 
 from kfvo_ros import geometry
-from kfvo_ros.camera import write_camera_info
 from kfvo_ros.odometry.base_motion import T_BODY_OPTICAL, base_pose
 from kfvo_ros.odometry.factory import make_odometry
 from kfvo_ros.odometry.options import OdometryOptions
 from kfvo_ros.sequences.base import Frame
+from kfvo_ros.sequences.calibration import write_camera_info
+from kfvo_ros.trajectory import NANOSECONDS
 
 FRAMES = make_frames()
 CAMERA = FRAMES[0].camera
@@ -77,8 +80,9 @@ def test_reliable_subscription_to_a_best_effort_camera_logs_the_remedy():
         assert '[ERROR]' in line and IMAGE in line and 'set image_qos to auto' in line
 
 
-def test_compressed_images():
-    with Rig(sensor_msgs.CompressedImage, f'{IMAGE}/compressed') as rig:
+@pytest.mark.parametrize('topic', [f'{IMAGE}/compressed', '/camera/jpeg'])
+def test_compressed_images_on_a_topic_of_any_name(topic):
+    with Rig(sensor_msgs.CompressedImage, topic) as rig:
         for frame in FRAMES[:6]:
             rig.info.publish(to_info(CAMERA, frame.stamp_ns))
             message = sensor_msgs.CompressedImage(
@@ -89,6 +93,18 @@ def test_compressed_images():
     with Rig() as rig:
         raw = [to_pose(message.pose.pose) for message in rig.run(FRAMES[:6])]
     np.testing.assert_allclose(compressed, raw, atol=1e-9)  # PNG is lossless
+
+
+def test_a_camera_that_restarts_with_another_type():
+    with Rig() as rig, Listener({}) as other:
+        rig.run(FRAMES[:3])
+        rig.listener.node.destroy_publisher(rig.image)
+        camera = other.node.create_publisher(sensor_msgs.CompressedImage, IMAGE, RELIABLE)
+        wait_until(camera.get_subscription_count)
+        data = cv2.imencode('.png', FRAMES[3].image)[1].tobytes()
+        camera.publish(stamped(sensor_msgs.CompressedImage(format='png', data=data),
+                               FRAMES[3].stamp_ns))
+        assert stamp_ns(rig.odometry(4)[-1]) == FRAMES[3].stamp_ns
 
 
 def encoded(image: np.ndarray) -> list[tuple[str, np.ndarray, int]]:
@@ -130,7 +146,7 @@ def test_all_encodings_give_the_same_poses():
 def invalid_images(stamp: int, image: np.ndarray) -> list:
     """Return messages that are not images."""
     return [to_image(stamp, image, **fields) for fields in (
-        {'data': []}, {'encoding': 'nonsense'}, {'encoding': ''}, {'step': 7},
+        {'data': []}, {'encoding': 'nonsense'}, {'encoding': ''}, {'step': 500},
         {'step': 2 ** 31}, {'width': 0, 'height': 0, 'step': 0, 'data': []}, {'height': 0},
         {'width': 2 ** 32 - 1}, {'encoding': 'rgb8'}, {'height': HEIGHT + 1})]
 
@@ -149,10 +165,34 @@ def test_invalid_images_are_refused_and_counted():
         assert not is_origin(after[0])  # no reset
         rig.wait_for_value('images processed', 6)
         assert rig.state()[0] == 0
-        # A second image of the same stamp is refused too.
+        # A second image of the same stamp is left out.
         rig.send([FRAMES[5]])
-        rig.wait_for_value('images refused', len(bad) + 1)
-        assert 'have the stamp' in rig.state()[1]
+        rig.wait_for_value('images late', 1)
+        assert rig.state()[0] == WARN and 'left out the image of stamp' in rig.state()[1]
+
+
+def test_a_clock_message_that_goes_back_resets_at_once():
+    """A looped bag with --clock: the first image of the second loop is the origin."""
+    with Rig(use_sim_time=True) as rig:
+        clock = rig.listener.node.create_publisher(rosgraph_msgs.Clock, '/clock', 10)
+        wait_until(clock.get_subscription_count)
+
+        def show(stamp: int) -> None:
+            message = rosgraph_msgs.Clock()
+            message.clock.sec, message.clock.nanosec = divmod(stamp, NANOSECONDS)
+            clock.publish(message)
+            wait_until(lambda: stamp_ns(rig.listener.messages(DIAGNOSTICS)[-1]) == stamp)
+
+        wait_until(lambda: rig.listener.messages(DIAGNOSTICS))
+        rig.run(FRAMES[1:8])
+        show(FRAMES[7].stamp_ns)
+        show(FRAMES[1].stamp_ns)
+        rig.send(FRAMES[1:3])
+        messages = rig.odometry(9)
+        assert [stamp_ns(message) for message in messages[7:]] == [
+            frame.stamp_ns for frame in FRAMES[1:3]]
+        assert [index for index, message in enumerate(messages) if is_origin(message)] == [0, 7]
+        rig.wait_for_value('resets', 1)
 
 
 def test_another_resolution_resets():
@@ -165,6 +205,21 @@ def test_another_resolution_resets():
         rig.wait_for_line('restarting at the origin: the calibration changed')
         rig.wait_for_line('images of 640x480, fx 400.0')
         rig.wait_for_value('resets', 1)
+
+
+def test_alternating_resolutions_are_a_warning_and_a_few_lines():
+    large = CAMERA.scaled(2 * WIDTH, 2 * HEIGHT)
+    with Rig() as rig:
+        rig.info.publish(to_info(CAMERA))
+        for index, frame in enumerate(FRAMES[:16]):
+            rig.send([frame if index % 2 else Frame(
+                frame.stamp_ns, cv2.resize(frame.image, (2 * WIDTH, 2 * HEIGHT)), large)],
+                with_info=False)
+        rig.odometry(16)
+        rig.wait_for_value('resets', 15)
+        assert rig.state()[:2] == (WARN, '3 resets within 60 s')
+        assert sum('images of' in line for line in rig.lines) <= 4
+        assert sum('restarting at the origin' in line for line in rig.lines) == 1
 
 
 def test_without_calibration_it_waits_and_logs_both_remedies():
@@ -220,7 +275,8 @@ def test_camera_info_of_another_aspect_ratio_is_refused():
         rig.info.publish(cropped)
         rig.send(FRAMES[:3], with_info=False)
         line = rig.wait_for_line('[ERROR]')
-        problem = (f'the calibration is for {WIDTH}x{HEIGHT - 40} images, {WIDTH}x{HEIGHT} came; '
+        problem = (f'CameraInfo on {INFO}: the calibration is for {WIDTH}x{HEIGHT - 40} '
+                   f'images, {WIDTH}x{HEIGHT} came; '
                    'give the calibration of these images')
         assert problem in line
         rig.wait_for_value('images refused', 3)

@@ -5,13 +5,12 @@
 from __future__ import annotations
 
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+from command_lines import run_python
 from node_rig import (
     BEST_EFFORT,
     DIAGNOSTICS,
@@ -100,9 +99,8 @@ def test_large_images_arrive_from_a_camera_with_the_profile():
         pytest.skip('this is not Fast DDS')
     profile = Path(__file__).parents[2] / 'config' / 'fastdds_large_images.xml'
     with Listener({'/large': sensor_msgs.Image}, BEST_EFFORT) as listener:
-        done = subprocess.run(
-            [sys.executable, '-c', LARGE], text=True, capture_output=True, timeout=30.0,
-            env=ENVIRONMENT | {'FASTRTPS_DEFAULT_PROFILES_FILE': str(profile)})
+        done = run_python(
+            '-c', LARGE, env=ENVIRONMENT | {'FASTRTPS_DEFAULT_PROFILES_FILE': str(profile)})
         assert (done.returncode, done.stderr) == (0, '')
         wait_until(lambda: listener.messages('/large')[-1].header.stamp.sec == 59)
     received = [message.header.stamp.sec for message in listener.messages('/large')]

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import resource
 from pathlib import Path
 
 import numpy as np
@@ -69,6 +70,33 @@ def test_save_trajectory_writes_all_poses_to_a_new_file_each_time(rig):
     assert [list(read_tum(file).stamps_ns) for file in files] == [
         STAMPS_NS[:count] for count in (12, 20)]
     assert rig.file not in files  # that is the growing one
+
+
+def test_a_full_disk_is_told_and_no_pose_is_lost(rig):
+    """A limit on the size of the node's files simulates it."""
+    rig.reset()
+    first = rig.run(make_frames()[:1])
+    limits = resource.prlimit(rig.process.pid, resource.RLIMIT_FSIZE, (300, -1))
+    try:
+        rig.run(make_frames()[1:30])
+        wait_until(lambda: 'cannot write the trajectory' in rig.state()[1])
+        level, summary, _ = rig.state()
+        assert level == 1 and 'poses wait in memory' in summary
+        answer = rig.call(std_srvs.Trigger, 'save_trajectory')
+        assert not answer.success and 'cannot write the trajectory' in answer.message
+    finally:
+        resource.prlimit(rig.process.pid, resource.RLIMIT_FSIZE, limits)
+    rig.run(make_frames()[30:32])
+    wait_until(lambda: rig.state()[0] == 0)
+    answer = rig.call(std_srvs.Trigger, 'save_trajectory')
+    assert answer.success and answer.message.startswith('32 poses written to ')
+    saved = Path(answer.message.partition(' written to ')[2])
+    assert list(read_tum(saved).stamps_ns) == STAMPS_NS[:32]
+    assert not [path for path in saved.parent.iterdir() if path.name.startswith('.')]
+    rig.reset()
+    logs = [read_tum(path) for path in saved.parent.iterdir() if path.stat().st_size]
+    assert sum(list(log.stamps_ns) == STAMPS_NS[:32] for log in logs) == 2
+    assert len(first) == 1
 
 
 def test_stamps_that_go_back_reset(rig):

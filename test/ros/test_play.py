@@ -6,14 +6,13 @@ from __future__ import annotations
 
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 from bag_writers import LATER_NS, START_NS, STORAGES, BagBuilder, Records
-from command_lines import assert_one_readable_line, one_readable_line
+from command_lines import assert_one_readable_line, one_readable_line, run_python
 from ros_processes import ENVIRONMENT, Listener, run_module, running_module, wait_until
 from rosbags.interfaces import (
     Qos,
@@ -27,7 +26,9 @@ from rosbags.typesys import get_types_from_msg
 from sequence_writers import make_image, make_poses, pose_numbers
 
 from kfvo_ros.trajectory import NANOSECONDS
+from kfvo_ros.utils.process import time_limit
 
+diagnostic_msgs = pytest.importorskip('diagnostic_msgs.msg')
 geometry_msgs = pytest.importorskip('geometry_msgs.msg')
 rosgraph_msgs = pytest.importorskip('rosgraph_msgs.msg')
 sensor_msgs = pytest.importorskip('sensor_msgs.msg')
@@ -145,7 +146,7 @@ def test_loop_and_clock(bags):
             PLAY, bags['sqlite3'], '--loop', '--clock', '100', '--wait-for-subscribers') as player:
         wait_until(lambda: len(listener.messages(CAM0)) >= 2 * FRAMES + 3)
         player.send_signal(signal.SIGINT)
-        output, problems = player.communicate(timeout=2.0)
+        output, problems = player.communicate(timeout=time_limit(2.0))
     assert player.returncode == 0, problems
     assert 'loop 3' in problems and 'interrupted' in output
     played_stamps = stamps(listener, CAM0)
@@ -226,7 +227,7 @@ def test_interrupted_while_playing(sent, bags):
             PLAY, bags['ros1'], '--rate', '0.1') as player:
         wait_until(lambda: listener.received)
         player.send_signal(sent)
-        output, problems = player.communicate(timeout=2.0)
+        output, problems = player.communicate(timeout=time_limit(2.0))
     assert player.returncode == 0, problems
     assert 'Traceback' not in problems
     assert 'messages published, interrupted at' in output
@@ -240,9 +241,32 @@ def test_waiting_for_subscribers_is_logged_and_can_be_interrupted(bags):
         assert not listener.received
         player.send_signal(signal.SIGTERM)
         began = time.monotonic()
-        _, problems = player.communicate(timeout=10.0)
-        assert time.monotonic() - began < 2.0
+        _, problems = player.communicate(timeout=time_limit(10.0))
+        assert time.monotonic() - began < time_limit(2.0)
     assert player.returncode == 0 and 'Traceback' not in problems
+
+
+def test_waiting_for_processing_ends_when_the_node_is_idle(bags):
+    """The node reports 5 images that wait, then none."""
+    with Listener(EUROC) as listener, running_module(
+            PLAY, bags['ros1'], '--wait-for-processing', '--rate', '10') as player:
+        reports = listener.node.create_publisher(diagnostic_msgs.DiagnosticArray, '/diagnostics',
+                                                 10)
+
+        def report(waiting: int) -> None:
+            values = {'images received': '12', 'images waiting': str(waiting)}
+            reports.publish(diagnostic_msgs.DiagnosticArray(status=[
+                diagnostic_msgs.DiagnosticStatus(name='kfvo: odometry', values=[
+                    diagnostic_msgs.KeyValue(key=key, value=value)
+                    for key, value in values.items()])]))
+            time.sleep(0.05)
+
+        wait_until(lambda: len(listener.messages(CAM0)) == FRAMES)
+        for _ in range(20):
+            report(5)
+        assert player.poll() is None
+        wait_until(lambda: report(0) or player.poll() is not None)
+        assert player.returncode == 0
 
 
 @pytest.mark.parametrize(('arguments', 'parts'), [
@@ -277,8 +301,7 @@ def test_without_rclpy_one_line_shows_how_to_install_it(bags):
     code = ("import sys; sys.modules['rclpy'] = None; from kfvo_ros.play import main; "
             'sys.exit(main(sys.argv[1:]))')
     for arguments in ([], ['--ros-args', '-r', 'a:=b']):
-        done = subprocess.run([sys.executable, '-c', code, str(bags['ros1']), *arguments],
-                              text=True, capture_output=True, env=ENVIRONMENT, timeout=60)
+        done = run_python('-c', code, bags['ros1'], *arguments, env=ENVIRONMENT)
         assert done.returncode == 1
         line, = done.stderr.splitlines()
         assert 'rclpy is missing: source /opt/ros/jazzy/setup.bash' in line

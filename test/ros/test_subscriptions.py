@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Lost messages, counted by the gaps in their sequence numbers."""
+"""Subscriptions: lost messages, several publishers, and where the calibration is found."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from ros_processes import Listener, wait_until
 
-from kfvo_ros.ros.subscriptions import QosMatchingSubscription, SequenceGapCounter
+from kfvo_ros.errors import KfvoError
+from kfvo_ros.ros.subscriptions import CameraSource, QosMatchingSubscription, SequenceGapCounter
 
 sensor_msgs = pytest.importorskip('sensor_msgs.msg')
 IMAGE = '/camera/image_raw'
@@ -63,3 +64,18 @@ def test_messages_sent_before_discovery_are_not_counted_as_lost():
             camera.publish(sensor_msgs.Image())
             wait_until(lambda count=count: len(received) == count)
         assert subscription.lost == 0
+        assert subscription.publishers() == ['/listener', '/listener']
+
+
+@pytest.mark.parametrize('info', ['/front/camera_info', '/front/Scene/camera_info'])
+def test_calibration_is_found_on_the_topics_that_drivers_use(info):
+    with Listener({}) as node_side, Listener({}) as camera_side:
+        source = CameraSource(node_side.node, '/front/Scene')
+        publisher = camera_side.node.create_publisher(sensor_msgs.CameraInfo, info, 1)
+        wait_until(publisher.get_subscription_count)
+        publisher.publish(sensor_msgs.CameraInfo(width=640, height=480, k=[
+            400.0, 0.0, 320.0, 0.0, 400.0, 240.0, 0.0, 0.0, 1.0]))
+        wait_until(lambda: source.camera(640, 480))
+        assert source.name == info and source.camera(320, 240).fx == 200.0
+        with pytest.raises(KfvoError, match=f'CameraInfo on {info}: .* is for 640x480 images'):
+            source.camera(640, 400)

@@ -26,9 +26,10 @@ def test_worker_drops_and_counts_the_oldest_items():
     assert worker.put(0) == 0
     wait_until(lambda: taken)
     assert [worker.put(item) for item in range(1, 6)] == [0, 0, 1, 1, 1]
-    assert not idle.is_set()
+    assert not idle.is_set() and worker.waiting == 3  # one is in work
     gate.set()
     wait_until(idle.is_set)
+    assert worker.waiting == 0
     worker.stop()
     assert taken == [0, 4, 5]
 
