@@ -9,13 +9,15 @@ import multiprocessing
 import os
 import shutil
 import signal
+import subprocess
 import threading
+import time
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import yaml
-from command_lines import run_interrupted
+from command_lines import children_of, is_running, run_interrupted, run_python, started
 
 pytest.importorskip('stable_baselines3', reason="stable-baselines3 is not installed: pip install "
                     "'.[train]'")
@@ -29,10 +31,10 @@ from kfvo_ros.errors import KfvoError
 from kfvo_ros.keyframes.learned import read_policy
 from kfvo_ros.training.plan import TrainingFiles
 from kfvo_ros.training.ppo import Trainer
+from kfvo_ros.utils import files
 from kfvo_ros.utils.files import find_config
-from kfvo_ros.utils.signals import SIGNALS
-
-pytestmark = pytest.mark.usefixtures('own_signals')
+from kfvo_ros.utils.process import time_limit
+from kfvo_ros.utils.signals import SIGNALS, Interrupted, signals_handled
 
 SEQUENCES = ('synthetic:1-2:smooth', '--validation', 'synthetic:3:smooth', '--stop', 25)
 POLICY = 'policy.safetensors'
@@ -150,6 +152,50 @@ def test_a_training_resumes_at_its_last_step(folder, trained, tmp_path, monkeypa
     assert scalars(Path())['train/learning_rate'] == [32, 64, 96]
 
 
+@pytest.mark.parametrize('more', [(), ('--steps', 40)])
+def test_resuming_a_finished_training_changes_nothing(more, folder, trained, tmp_path,
+                                                      monkeypatch, capsys):
+    shutil.copytree(trained, tmp_path / 'again')
+    monkeypatch.chdir(tmp_path / 'again')
+
+    def state() -> dict[str, tuple[int, bytes]]:
+        return {str(path): (path.stat().st_mtime_ns, path.read_bytes() if path.is_file() else b'')
+                for path in (Path(), *Path().rglob('*'))}
+
+    before = state()
+    capsys.readouterr()
+    assert train.main(arguments(folder, '--resume', *more)) == 0
+    assert state() == before
+    output, errors = capsys.readouterr()
+    assert errors == '' and output.startswith(f'{POLICY} is complete: all ')
+    assert len(output.splitlines()) == 1
+
+
+@pytest.mark.parametrize('name', [POLICY, 'policy.training/checkpoint.pt'])
+def test_a_damaged_file_is_not_resumed(name, folder, trained, tmp_path, monkeypatch, capsys):
+    shutil.copytree(trained, tmp_path / 'again')
+    monkeypatch.chdir(tmp_path / 'again')
+    content = bytearray(Path(name).read_bytes())
+    content[len(content) // 2] ^= 4
+    Path(name).write_bytes(content)
+    capsys.readouterr()
+    assert train.main(arguments(folder, '--resume', '--steps', 96)) == 1
+    line, = capsys.readouterr().err.splitlines()
+    assert f'{name}: ' in line and 'it is damaged, its SHA-256 is not the stored one' in line
+
+
+def test_a_training_in_use_is_left_alone(folder, trained, tmp_path, monkeypatch, capsys):
+    shutil.copytree(trained, tmp_path / 'again')
+    monkeypatch.chdir(tmp_path / 'again')
+    monkeypatch.setattr(files, 'LOCK_TIMEOUT_S', 0.1)
+    with files.locked(Path('policy.training')):
+        for more in (['--resume', '--steps', 96], ['--overwrite']):
+            assert train.main(arguments(folder, *more)) == 1
+            line = capsys.readouterr().err.splitlines()[-1]
+            assert f'policy.training is in use by process {os.getpid()}: wait until' in line
+    assert torch.load('policy.training/checkpoint.pt', weights_only=True)['steps'] == 64
+
+
 def test_without_a_best_policy_the_next_one_is_the_best(folder, trained, tmp_path, monkeypatch):
     shutil.copytree(trained, tmp_path / 'again')
     monkeypatch.chdir(tmp_path / 'again')
@@ -178,7 +224,7 @@ def test_a_signal_to_all_processes_interrupts_and_saves(number, folder, trained,
 
     monkeypatch.setattr(Trainer, 'after_update', interrupted)
     monkeypatch.chdir(tmp_path)
-    assert train.main(arguments(folder, '--workers', 2)) == 1
+    assert train.main(arguments(folder, '--workers', 2)) == 128 + number
     line = capsys.readouterr().err.splitlines()[-1]
     assert line.startswith('kfvo_train: error: interrupted; policy.training holds the policy '
                            'after 32 steps')
@@ -196,7 +242,7 @@ def test_an_error_after_a_signal_is_an_interruption():
 
     trainer = SimpleNamespace(steps=7, learn=learn, save=lambda: saved.append(7),
                               plan=SimpleNamespace(recipe=SimpleNamespace(steps=9)))
-    with pytest.raises(KfvoError, match='^interrupted; .* holds the policy after 7 steps'):
+    with signals_handled(), pytest.raises(Interrupted, match='holds the policy after 7 steps'):
         train._learn(trainer, TrainingFiles(POLICY))
     assert saved == [7]
 
@@ -207,9 +253,32 @@ def test_an_interruption_saves_policy_and_checkpoint(folder, trained, tmp_path):
     status, _, problems = run_interrupted(
         signal.SIGINT, lambda: (logs / 'checkpoint.pt').exists(), '-m', 'kfvo_ros.train',
         *arguments(folder, '--steps', '100000')[:-4], '--output', output, '--steps', 100_000)
-    assert status == 1
+    assert status == 128 + signal.SIGINT
     assert problems.splitlines()[-1].startswith('kfvo_train: error: interrupted; ')
     assert str(logs) in problems.splitlines()[-1] and 'Traceback' not in problems
     steps = torch.load(logs / 'checkpoint.pt', weights_only=True)['steps']
     assert f'after {steps} steps' in problems.splitlines()[-1] and steps >= 32
     assert read_policy(logs / 'last.safetensors').training['steps'] == steps
+
+
+def test_a_killed_training_leaves_no_worker_and_is_resumed(folder, trained, tmp_path):
+    output, logs = tmp_path / POLICY, tmp_path / 'policy.training'
+    command = [*arguments(folder)[:-2], '--output', output, '--workers', 2, '--steps']
+    with started('-m', 'kfvo_ros.train', *command, 100_000, stdout=subprocess.DEVNULL,
+                 stderr=subprocess.DEVNULL) as process:
+        end = time.monotonic() + time_limit(300.0)
+        while not (logs / 'checkpoint.pt').exists():
+            assert process.poll() is None and time.monotonic() < end
+            time.sleep(0.02)
+        workers = children_of(process.pid)
+        assert len(workers) >= 2
+        process.kill()
+        process.wait()
+        while any(map(is_running, workers)):
+            assert time.monotonic() < end
+            time.sleep(0.02)
+    steps = torch.load(logs / 'checkpoint.pt', weights_only=True)['steps']
+    done = run_python('-m', 'kfvo_ros.train', *command, steps + 32, '--resume')
+    assert done.returncode == 0, done.stderr
+    assert torch.load(logs / 'checkpoint.pt', weights_only=True)['steps'] == steps + 32
+    assert not list(tmp_path.rglob('*.lock'))

@@ -17,7 +17,7 @@ from kfvo_ros import train
 
 
 @pytest.fixture(autouse=True)
-def elsewhere(tmp_path, monkeypatch, own_signals) -> None:
+def elsewhere(tmp_path, monkeypatch) -> None:
     """Work in an empty folder."""
     monkeypatch.chdir(tmp_path)
 

@@ -3,25 +3,24 @@
 """Learned keyframe policy: a small network run in numpy, and its file.
 
 A policy file is safetensors with JSON metadata: format version, signature (key ``setting``), guard
-(key ``rail``), clipping of the observation and training summary. Its tensors are ``mean``,
-``std``, ``layers.N.weight`` and ``layers.N.bias``.
+(key ``rail``), clipping of the observation, training summary and digest, which may be missing.
+Its tensors are ``mean``, ``std``, ``layers.N.weight`` and ``layers.N.bias``.
 """
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save
+from safetensors import SafetensorError
 
 from kfvo_ros.errors import KfvoError, reason_of
 from kfvo_ros.keyframes.base import DecisionInput, KeyframePolicy, ObservationLayout, indices_of
 from kfvo_ros.keyframes.guard import KeyframeGuard
-from kfvo_ros.utils.files import atomic_write
+from kfvo_ros.utils.files import user_path
+from kfvo_ros.utils.tensor_files import MAX_NUMBER, is_sane, read_tensors, write_tensors
 
 CLIP = 10.0
 """Standardised observations are clipped to +-CLIP in training, and where a file names no value."""
@@ -134,10 +133,7 @@ class PolicyFile:
                     'rail': asdict(self.guard), 'clip': float(self.actor.clip),
                     'training': self.training}
         try:
-            with atomic_write(path) as draft:
-                draft.write_bytes(save({name: np.ascontiguousarray(each)
-                                        for name, each in tensors.items()},
-                                       {METADATA_KEY: json.dumps(metadata)}))
+            write_tensors(path, METADATA_KEY, metadata, tensors)
         except (OSError, SafetensorError) as error:
             raise KfvoError(f'cannot write the policy {path}: {reason_of(error)}') from error
 
@@ -145,7 +141,7 @@ class PolicyFile:
 def find_policy(path: str | None, backbone: str) -> Path | None:
     """Return `path`, else the policy file that comes with the backbone, None without one."""
     if path is not None:
-        return Path(path).expanduser()
+        return user_path(path)
     bundled = Path(__file__).with_name(f'{backbone}.safetensors')
     return bundled if bundled.exists() else None
 
@@ -153,16 +149,13 @@ def find_policy(path: str | None, backbone: str) -> Path | None:
 def read_policy(path: Path) -> PolicyFile:
     """Read and validate a policy file; raises KfvoError."""
     try:
-        with safe_open(path, 'np') as file:
-            text = (file.metadata() or {}).get(METADATA_KEY)
-            if text is None:
-                raise KfvoError(f'{path} is no policy: {EXPECTED}, other tensors came')
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        return _parse_policy(json.loads(text), tensors)
+        return _parse_policy(*read_tensors(path, METADATA_KEY))
     except (OSError, SafetensorError) as error:
         raise KfvoError(f'cannot read the policy {path}: {EXPECTED}; {reason_of(error)}'
                         ) from error
-    except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
+    except ValueError as error:
+        raise KfvoError(f'{path}: {EXPECTED}; {reason_of(error)}') from error
+    except (KeyError, TypeError, AttributeError, RecursionError) as error:
         raise KfvoError(f'{path}: {EXPECTED}; {type(error).__name__}: {reason_of(error)}'
                         ) from error
 
@@ -208,12 +201,12 @@ def _expect(kind: type, wanted: str, **values: Any) -> None:
 
 
 def _check_actor(actor: Actor, size: int) -> None:
-    """Raise ValueError unless the network maps `size` inputs to two finite logits."""
+    """Raise ValueError unless the network maps `size` inputs to two logits by sane numbers."""
     weights = [array for layer in actor.layers for array in (layer.weight, layer.bias)]
     if any(array.dtype != np.float32 for array in weights) \
-            or not all(np.isfinite(array).all() for array in (*weights, actor.mean, actor.std)) \
+            or not all(map(is_sane, (*weights, actor.mean, actor.std))) \
             or not (actor.std > 0.0).all():
-        raise ValueError('finite float32 numbers and a positive std are needed')
+        raise ValueError(f'float32 numbers up to {MAX_NUMBER:.0e} and a positive std are needed')
     if not 0.0 < actor.clip < float('inf'):
         raise ValueError(f'clip: expected a finite number above 0, came {actor.clip}')
     sizes = [size, *(len(layer.bias) for layer in actor.layers)]

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from tqdm import tqdm
 
 from kfvo_ros.backbones.base import Backbone
 from kfvo_ros.errors import KfvoError, reason_of
@@ -39,6 +38,7 @@ from kfvo_ros.training.evaluation import (
 from kfvo_ros.training.plan import SUFFIX, TrainingFiles, TrainingPlan, TrainingSetup
 from kfvo_ros.utils.config import to_mapping
 from kfvo_ros.utils.files import atomic_write, find_config, read_yaml
+from kfvo_ros.utils.progress import progress
 
 ROWS_FILE = 'ablation.yaml'
 MIN_VALIDATIONS = 8
@@ -145,7 +145,7 @@ class PolicyTest:
              backbone: Backbone) -> PolicyTest:
         """Return the test, with its sequences encoded as in use; raises KfvoError."""
         cache = setup.sequence_cache(backbone)
-        encoded = [cache.sequence(text) for text in tqdm(sequences, unit='sequence', desc='test')]
+        encoded = [cache.sequence(text) for text in progress(sequences, 'sequence', 'test')]
         signature = factory.signature_of(setup.odometry, backbone)
         return cls(sequences, PolicyEvaluation(encoded, backbone, signature), setup.odometry)
 

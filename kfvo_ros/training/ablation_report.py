@@ -123,7 +123,7 @@ class AblationReport:
         self._curves.append(read_curve(results[0].row, reward, logs))
         write_csv(self.folder / CSV, [*self._results, *self.references])
         with atomic_write(self.folder / MARKDOWN) as draft:
-            draft.write_text(self.table, encoding='utf-8')
+            draft.write_text(self.table, encoding='utf-8', errors='backslashreplace')
         plot_curves(self.folder / CURVES, self._curves)
 
 

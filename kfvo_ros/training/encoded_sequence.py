@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from itertools import islice
@@ -12,8 +11,7 @@ from pathlib import Path
 from typing import cast
 
 import numpy as np
-from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save_file
+from safetensors import SafetensorError
 
 from kfvo_ros.backbones.base import Backbone, Encoded
 from kfvo_ros.backbones.geometric.backbone import GeometricBackbone
@@ -23,7 +21,7 @@ from kfvo_ros.errors import KfvoError, reason_of
 from kfvo_ros.sequences.base import Frame, Sequence
 from kfvo_ros.tracking.tracker import Tracks
 from kfvo_ros.trajectory import Trajectory, associate
-from kfvo_ros.utils.files import atomic_write
+from kfvo_ros.utils.tensor_files import read_tensors, write_tensors
 
 NO_IMAGE = np.zeros((0, 0), dtype=np.uint8)
 FILE_KEY = 'kfvo_drive'
@@ -114,9 +112,7 @@ def write_encoded_sequence(path: Path, sequence: EncodedSequence) -> None:
     metadata = {'name': sequence.name, 'camera': asdict(camera)}
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_write(path) as draft:
-            save_file({name: np.ascontiguousarray(array) for name, array in arrays.items()},
-                      draft, {FILE_KEY: json.dumps(metadata)})
+        write_tensors(path, FILE_KEY, metadata, arrays)
     except (OSError, SafetensorError) as error:
         raise KfvoError(f'cannot keep tracks in {path.parent}: {reason_of(error)}') from error
 
@@ -124,9 +120,7 @@ def write_encoded_sequence(path: Path, sequence: EncodedSequence) -> None:
 def read_encoded_sequence(path: Path) -> EncodedSequence | None:
     """Read a sequence; return None for a missing or damaged file."""
     try:
-        with safe_open(path, 'np') as file:
-            metadata = json.loads((file.metadata() or {})[FILE_KEY])
-            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        metadata, arrays = read_tensors(path, FILE_KEY)
         _check_arrays(arrays)
         camera = Camera(**metadata['camera']
                         | {'distortion': tuple(metadata['camera']['distortion'])})
@@ -168,5 +162,5 @@ def _encoded_frame(stamp_ns: np.int64, descriptor: np.ndarray, index: np.int64,
                    tracked: tuple[np.ndarray, ...]) -> Encoded:
     *columns, points = tracked
     tracks, usable = Tracks(*columns), np.isfinite(points).all(axis=1)
-    return Encoded(int(stamp_ns), descriptor,
-                   FrameTracks(int(index), tracks.select(usable), points[usable]), tracks)
+    frame_tracks = FrameTracks(int(index), tracks.select(usable), points[usable])
+    return Encoded(int(stamp_ns), descriptor, frame_tracks, tracks, frame_tracks.blind)

@@ -20,6 +20,7 @@ from kfvo_ros.training.sampler import EnvironmentConfig
 from kfvo_ros.training.sequence_cache import EncodedSequenceCache
 from kfvo_ros.utils.commands import expand_ranges
 from kfvo_ros.utils.config import required
+from kfvo_ros.utils.files import user_path
 
 MIN_SEQUENCES_TO_SPLIT, VALIDATION_SHARE = 5, 0.1
 """With this many sequences, the last share is for validation where none is named."""
@@ -112,7 +113,7 @@ class TrainingFiles:
     """
 
     def __init__(self, output: str) -> None:
-        self.output = Path(output).expanduser()
+        self.output = user_path(output)
         if self.output.suffix != SUFFIX:
             raise KfvoError(f'expected an --output that ends in {SUFFIX}, came {output}')
         self.folder = self.output.with_suffix('.training')

@@ -15,11 +15,11 @@ from typing import Any
 
 from kfvo_ros import __version__
 from kfvo_ros.backbones.base import Backbone
-from kfvo_ros.camera import read_camera_info
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.odometry import factory
 from kfvo_ros.odometry.options import SequenceOptions
 from kfvo_ros.sequences.base import CALIBRATION_FILE, Sequence
+from kfvo_ros.sequences.calibration import read_camera_info
 from kfvo_ros.training.augmentation import Augmentation, SequenceVariant
 from kfvo_ros.training.encoded_sequence import (
     EncodedSequence,
@@ -27,6 +27,7 @@ from kfvo_ros.training.encoded_sequence import (
     read_encoded_sequence,
     write_encoded_sequence,
 )
+from kfvo_ros.utils.files import user_path
 
 MIN_FRAMES = 20
 """Fewer frames give an episode hardly any decisions."""
@@ -107,7 +108,7 @@ class EncodedSequenceCache:
 
     def _file_stem(self, text: str, augmentation: Augmentation | None, number: int) -> str:
         """Return a file name that changes with the version, the inputs and the settings."""
-        path, camera = Path(text).expanduser(), self.sequence_options.camera
+        path, camera = user_path(text), self.sequence_options.camera
         options = asdict(self.sequence_options) | {
             'camera': camera and asdict(read_camera_info(Path(camera)))}
         identity = {'version': __version__,

@@ -18,6 +18,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.training.env import EpisodeVecEnv, Observations
+from kfvo_ros.utils.children import end_with_parent
 from kfvo_ros.utils.process import single_threaded
 from kfvo_ros.utils.signals import signals_blocked
 
@@ -118,6 +119,9 @@ def _concatenate(parts: Sequence[Observations]) -> Observations:
 
 def _serve(pipe: Connection, maker: Callable[[], VecEnv]) -> None:
     """Execute the commands from the pipe until CLOSE, or until the other end is closed."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:  # which may be killed during a long step
+        end_with_parent(parent.join)
     with single_threaded(), contextlib.suppress(EOFError, ConnectionError):
         try:
             environment = maker()

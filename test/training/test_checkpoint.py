@@ -4,8 +4,12 @@
 
 from __future__ import annotations
 
+import math
+import os
 import pickle
+import random
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -116,6 +120,78 @@ def test_a_checkpoint_of_an_older_version_may_lack_keys(plan, tmp_path):
              if key not in ('reading', 'vggt')}
     Checkpoint(older, 5, 1.0, {}, {}).write(path)
     assert read_checkpoint(path, plan).steps == 5
+
+
+def flip(path: Path, content: bytes, bit: int) -> None:
+    """Write the content with one bit flipped."""
+    changed = bytearray(content)
+    changed[bit // 8] ^= 1 << bit % 8
+    path.write_bytes(changed)
+
+
+def refusal_of(path: Path, plan: TrainingPlan) -> str:
+    """Return the one line with which a checkpoint is refused."""
+    with pytest.raises(KfvoError) as refusal:
+        read_checkpoint(path, plan)
+    line = str(refusal.value)
+    assert str(path) in line and len(line.splitlines()) == 1
+    return line
+
+
+TENSORS = {'policy': {'weight': torch.linspace(-1.0, 1.0, 999), 'bias': torch.zeros(3)},
+           'policy.optimizer': {'state': {0: {'step': torch.tensor(4.0)}}, 'param_groups': [
+               {'lr': 3e-4, 'betas': (0.9, 0.999), 'params': [0], 'foreach': None}]}}
+STATISTICS = {'returns': {'mean': torch.zeros(()), 'var': torch.ones(()), 'count': 4.0}}
+
+
+def test_every_flipped_bit_is_found(plan, tmp_path):
+    path = tmp_path / 'checkpoint.pt'
+    Checkpoint(to_mapping(plan), 5, math.inf, TENSORS, STATISTICS).write(path)
+    content, rng, named = path.read_bytes(), random.Random(0), 0
+    for _ in range(200):
+        flip(path, content, rng.randrange(8 * len(content)))
+        named += 'it is damaged, its SHA-256 is not the stored one: copy it again, or replace' \
+            in refusal_of(path, plan)
+    assert named >= 190  # others are no ZIP files any more
+    for size in (len(content) - 1, len(content) - 71, len(content) // 2, 100):
+        path.write_bytes(content[:size])
+        refusal_of(path, plan)
+    path.write_bytes(content)
+    assert torch.equal(read_checkpoint(path, plan).parameters['policy']['weight'],
+                       TENSORS['policy']['weight'])
+    assert torch.load(path, weights_only=True)['steps'] == 5
+
+
+def test_a_checkpoint_of_an_older_version_has_no_digest(plan, tmp_path):
+    path = tmp_path / 'checkpoint.pt'
+    torch.save({'format_version': 1} | vars(Checkpoint(to_mapping(plan), 5, 1.0, TENSORS,
+                                                       STATISTICS)), path)
+    assert read_checkpoint(path, plan).steps == 5
+    content = path.read_bytes()
+    weights = TENSORS['policy']['weight'].numpy().tobytes()
+    flip(path, content, 8 * content.index(weights) + 5)
+    assert 'its CRC-32 is not the stored one' in refusal_of(path, plan)
+
+
+@pytest.mark.parametrize('change', [
+    {'parameters': {'policy': {'bias': torch.tensor([0.0, math.nan])}}},
+    {'parameters': {'policy.optimizer': {'param_groups': [{'lr': math.inf}]}}},
+    {'parameters': {'policy': {'bias': torch.tensor([1e30])}}},
+    {'statistics': {'returns': {'count': -1e300}}},
+    {'statistics': {'returns': {'var': torch.tensor([-math.inf])}}},
+    {'steps': -1}, {'steps': 10 ** 30}, {'steps': True}, {'best': math.nan}, {'best': 1}])
+def test_numbers_that_no_training_has_are_refused(change, plan, tmp_path):
+    path = tmp_path / 'checkpoint.pt'
+    replace(Checkpoint(to_mapping(plan), 5, 1.0, TENSORS, STATISTICS), **change).write(path)
+    line = refusal_of(path, plan)
+    assert 'expected a checkpoint that kfvo_train wrote' in line
+    if not change.keys() & {'steps', 'best'}:
+        assert 'numbers up to 1e+12 are needed' in line and '--overwrite' in line
+
+
+def test_a_fifo_is_not_waited_for(plan, tmp_path):
+    os.mkfifo(tmp_path / 'checkpoint.pt')
+    assert 'expected a file, found a FIFO' in refusal_of(tmp_path / 'checkpoint.pt', plan)
 
 
 def test_a_checkpoint_has_the_keys_of_the_first_version(plan):

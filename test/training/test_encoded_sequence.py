@@ -53,6 +53,17 @@ def test_a_damaged_file_is_read_as_none(tmp_path, damage):
     assert read_encoded_sequence(path) is None
 
 
+def test_a_flipped_bit_is_read_as_none(sequence_file, tmp_path):
+    path, content = tmp_path / 'sequence.safetensors', bytearray(sequence_file.read_bytes())
+    for place in (len(content) // 2, -1):
+        content[place] ^= 1
+        path.write_bytes(content)
+        assert read_encoded_sequence(path) is None
+        content[place] ^= 1
+    path.write_bytes(content)
+    assert read_encoded_sequence(path) is not None
+
+
 @pytest.fixture(scope='module')
 def sequence_file(sequence, tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp('sequence') / 'sequence.safetensors'
@@ -85,7 +96,7 @@ def test_a_file_with_inconsistent_arrays_is_read_as_none(sequence_file, tmp_path
     path = tmp_path / 'sequence.safetensors'
     arrays = load_file(sequence_file)
     with safe_open(sequence_file, 'np') as file:
-        metadata = file.metadata()
+        metadata = {FILE_KEY: file.metadata()[FILE_KEY]}
     changed = np.ascontiguousarray(change(arrays[name]))
     save_file(arrays | {name: changed}, path, metadata)
     assert read_encoded_sequence(path) is None

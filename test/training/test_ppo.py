@@ -30,8 +30,6 @@ from kfvo_ros.training.policy_network import export_actor
 from kfvo_ros.training.ppo import EPSILON, make_model
 from kfvo_ros.training.sampler import make_environment
 
-pytestmark = pytest.mark.usefixtures('own_signals')
-
 
 @pytest.fixture(scope='module')
 def trained():

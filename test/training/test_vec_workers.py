@@ -7,10 +7,12 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import time
 from multiprocessing import resource_tracker
 
 import numpy as np
 import pytest
+from command_lines import children_of, is_running, started
 
 pytest.importorskip('stable_baselines3', reason="stable-baselines3 is not installed: pip install "
                     "'.[train]'")
@@ -20,6 +22,7 @@ from gymnasium import spaces
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.training.env import OBSERVATION, EpisodeVecEnv
 from kfvo_ros.training.vec_workers import STEP, VecWorkers, _serve
+from kfvo_ros.utils.process import time_limit
 from kfvo_ros.utils.signals import SIGNALS, Interrupted
 
 OBSERVATIONS = {OBSERVATION: np.zeros((1, 2), np.float32)}
@@ -132,3 +135,35 @@ def test_a_worker_ends_quietly_with_its_pipe():
     ours.send((STEP, np.zeros(1)))
     _serve(theirs, ClosingEnvironment)
     assert ours.closed
+
+
+BUSY = """
+import sys
+import time
+
+from kfvo_ros.training.vec_workers import VecWorkers
+
+
+def make():
+    print('busy', flush=True)
+    time.sleep(600.0)
+
+
+if __name__ == '__main__':
+    VecWorkers([make])
+"""
+
+
+def test_a_busy_worker_ends_with_its_killed_parent(tmp_path):
+    script = tmp_path / 'busy.py'
+    script.write_text(BUSY)
+    with started(script) as parent:
+        assert parent.stdout.readline() == 'busy\n'
+        children = children_of(parent.pid)  # the worker, and the resource tracker
+        assert children
+        parent.kill()
+        parent.wait()
+        end = time.monotonic() + time_limit(60.0)
+        while any(map(is_running, children)):
+            assert time.monotonic() < end
+            time.sleep(0.02)

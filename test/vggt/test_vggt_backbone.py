@@ -147,6 +147,14 @@ def test_the_odometry_survives_a_model_of_nan():
     assert all(np.isfinite(update.T_world_camera).all() for update in updates)
 
 
+def test_black_images_are_lost(backbone):
+    black = replace(FRAMES[1], image=np.zeros_like(FRAMES[1].image))
+    odometry = KeyframeOdometry(backbone, ScriptedPolicy(True))
+    updates = [odometry.process(frame) for frame in (black, FRAMES[0], black, FRAMES[2])]
+    assert [update.status for update in updates] == [Status.LOST, Status.OK] * 2
+    assert [update.is_keyframe for update in updates] == [False, True] * 2
+
+
 @pytest.mark.parametrize(('height', 'width'), [(60, 80), (90, 60), (37, 122)])
 def test_intrinsics_are_those_of_the_native_image(height, width, backbone):
     """A ray has corresponding pixels in the fitted and the native image."""

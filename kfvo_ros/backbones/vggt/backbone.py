@@ -33,7 +33,9 @@ from kfvo_ros.backbones.vggt.runtime import (
 )
 from kfvo_ros.camera import Camera
 from kfvo_ros.errors import KfvoError
+from kfvo_ros.images import to_grey
 from kfvo_ros.sequences.base import Frame
+from kfvo_ros.tracking.blindness import is_flat
 
 IMAGE_WIDTH = 518
 """Width of the images that the published model was trained on [px]."""
@@ -133,7 +135,8 @@ class VggtBackbone(Backbone):
             descriptors = tokens[:, 0].float().cpu().numpy()
             # Copied: a view would keep the whole batch alive.
             return [Encoded(frame.stamp_ns, descriptor.copy(), FrameCache(
-                        fit, patch_grid(images), image.clone(), patches[None].clone()))
+                        fit, patch_grid(images), image.clone(), patches[None].clone()),
+                        blind=is_flat(to_grey(frame.image)))
                     for (frame, fit), descriptor, image, patches in zip(
                         frames, descriptors, images, tokens[:, NUM_PREFIX_TOKENS:])]
 

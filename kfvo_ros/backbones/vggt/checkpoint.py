@@ -2,7 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Weights of a model: located as a file or on the Hugging Face hub, checked, and loaded.
 
-Tensors are checked by name and shape before they are read, straight to their device and dtype.
+Tensors are checked by name and shape before they are read, straight to their device and dtype,
+and their numbers afterwards. A .pt file has checksums, which are checked too; a .safetensors file
+has none.
 """
 
 from __future__ import annotations
@@ -20,7 +22,6 @@ from huggingface_hub.errors import (
     HfHubHTTPError,
     LocalEntryNotFoundError,
 )
-from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor
 
@@ -28,6 +29,7 @@ from kfvo_ros.backbones.vggt.config import config_from_shapes
 from kfvo_ros.backbones.vggt.model import Vggt, set_precision
 from kfvo_ros.errors import KfvoError, MemoryFullError, reason_of
 from kfvo_ros.utils.process import available_mb
+from kfvo_ros.utils.tensor_files import MAX_NUMBER, DamagedFileError, check_zip
 
 HUB_FILES = {'facebook/VGGT-1B-Commercial': 'vggt_1B_commercial.pt'}
 DEFAULT_FILE = 'model.safetensors'
@@ -39,6 +41,8 @@ TENSORS_PER_MAPPING = 16
 """Tensors read before the file is mapped again: pages read from a mapping count as memory."""
 FLOATS = (torch.float32, torch.float16, torch.bfloat16, torch.float64)
 NOT_A_STATE_DICT = '{}: expected tensors by name and nothing else, as state_dict() gives them'
+UNREADABLE = ('cannot read the weights in {}; expected a whole .safetensors file, or a .pt file '
+              'of nothing but tensors: {}')
 MAX_LISTED = 3
 """Differing keys named in an error."""
 
@@ -86,7 +90,7 @@ def load_model(path: Path, device: torch.device, dtype: torch.dtype) -> Vggt:
     """Return the model in a ``.safetensors`` or ``.pt`` file, on `device`, ready to run.
 
     `dtype` is that of `set_precision`; the sizes follow from the tensors. Raises KfvoError for an
-    unreadable file and for tensors that are not a VGGT model's.
+    unreadable or damaged file and for tensors that are not a VGGT model's.
     """
     mapped = _map_tensors(path)
     found = {name: each for name, each in mapped.items() if name.startswith(MODEL_PREFIXES)}
@@ -101,11 +105,13 @@ def load_model(path: Path, device: torch.device, dtype: torch.dtype) -> Vggt:
     del found, mapped
     if device.type == 'cpu':
         _check_memory(sum(each.numel() * each.itemsize for each in expected.values()))
+    _check_sums(path)
     names, loaded = list(expected), dict[str, Tensor]()
     for first in range(0, len(names), TENSORS_PER_MAPPING):
         mapped = _map_tensors(path)
         loaded |= {name: mapped[name].to(device, expected[name].dtype, copy=True)
                    for name in names[first:first + TENSORS_PER_MAPPING]}
+    _check_numbers(path, loaded)
     model.load_state_dict(loaded, assign=True)
     return model.eval().requires_grad_(False)
 
@@ -127,13 +133,34 @@ def _map_tensors(path: Path) -> dict[str, Tensor]:
         state = torch.load(path, map_location='cpu', weights_only=True, mmap=True)
     except pickle.UnpicklingError as error:  # torch's message advises to run the code
         raise KfvoError(NOT_A_STATE_DICT.format(path)) from error
-    except (OSError, SafetensorError, RuntimeError, EOFError) as error:
-        raise KfvoError(f'cannot read the weights in {path}; expected a whole .safetensors file, '
-                        f'or a .pt file of nothing but tensors: {reason_of(error)}') from error
+    except Exception as error:  # torch's reader may raise anything for a damaged file
+        raise KfvoError(UNREADABLE.format(path, reason_of(error))) from error
     if not isinstance(state, dict) or not all(
             isinstance(name, str) and isinstance(each, Tensor) for name, each in state.items()):
         raise KfvoError(NOT_A_STATE_DICT.format(path))
     return state
+
+
+def _check_sums(path: Path) -> None:
+    """Raise KfvoError where a checksum in a .pt file differs."""
+    if path.suffix == '.safetensors':
+        return
+    try:
+        check_zip(path)
+    except DamagedFileError as error:
+        raise KfvoError(f'{path}: {error}, or download it again') from error
+    except Exception as error:  # so may zipfile
+        raise KfvoError(UNREADABLE.format(path, reason_of(error))) from error
+
+
+def _check_numbers(path: Path, tensors: dict[str, Tensor]) -> None:
+    """Raise KfvoError for a number that is not finite, or too large for any weight."""
+    for name, each in tensors.items():
+        low, high = map(float, each.aminmax())
+        if not -MAX_NUMBER <= low <= high <= MAX_NUMBER:
+            raise KfvoError(f'{path}: {name} has numbers from {low:.3g} to {high:.3g}, expected '
+                            f'up to {MAX_NUMBER:.0e} in size: the file is damaged, copy or '
+                            'download it again')
 
 
 def _check_tensors(found: dict[str, Tensor], expected: dict[str, Tensor]) -> None:
