@@ -46,8 +46,9 @@ SEQUENCES ?= $(patsubst $(KFVO_DATA)/%/,%,$(sort $(dir $(FOUND)))) \
 	synthetic:0-2:street synthetic:0-2:smooth synthetic:0-2:fast
 POLICY ?=
 OPTIONS ?= --seeds 0,1,2
+FAULTS ?=
 
-.PHONY: help demo bench-node bench-train bench-vggt results test lint clean
+.PHONY: help demo bench-node bench-train bench-vggt faults results test lint clean
 
 help:
 	@echo 'make demo    a rendered sequence through kfvo_node, over DDS, into demo/'
@@ -55,6 +56,8 @@ help:
 	@echo 'make bench-node   a minute of 752x480 at 20 Hz, then at twice what the node can take'
 	@echo 'make bench-train  decisions per second of the environment, and of PPO'
 	@echo 'make bench-vggt   a step of the VGGT backbone, in full and with reuse'
+	@echo 'make faults  damaged files, signals, kills and full disks (docs/faults.md), for an hour;'
+	@echo '             FAULTS="--only mcap,png --tries 50": some of them'
 	@echo 'make results  docs/results.md: all methods on KFVO_DATA, rooms and streets; POLICY=FILE: a'
 	@echo '              learned one too. It goes on where it was interrupted'
 	@echo 'make lint    ruff and mypy'
@@ -75,6 +78,9 @@ bench-train: $(TOOLS)
 
 bench-vggt: $(TOOLS)
 	$(VENV)/bin/python benchmarks/vggt.py --size 168x224
+
+faults: $(TOOLS)
+	$(VENV)/bin/python -m benchmarks.faults $(FAULTS)
 
 results: $(TOOLS)
 	cd '$(or $(wildcard $(KFVO_DATA)),.)' && '$(CURDIR)/$(VENV)/bin/python' -m \
@@ -105,5 +111,5 @@ $(TOOLS): $(INSTALLED)
 	@touch $@
 
 clean:
-	rm -rf .venv* build install log demo results *.egg-info .pytest_cache .ruff_cache .mypy_cache
+	rm -rf .venv* build install log demo faults results *.egg-info .pytest_cache .ruff_cache .mypy_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

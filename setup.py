@@ -26,6 +26,7 @@ setup(
     ],
     python_requires='>=3.10',
     install_requires=[
+        'lz4>=4.0',
         'mcap>=1.0',
         'numba>=0.58',
         'numpy>=1.26',
@@ -36,6 +37,7 @@ setup(
         'safetensors>=0.4',
         'threadpoolctl>=3.1',
         'tqdm>=4.60',
+        'zstandard>=0.20',
     ],
     extras_require={
         # ROS 2 Jazzy as wheels (Linux x86-64 only), for machines without /opt/ros. The

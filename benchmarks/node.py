@@ -17,6 +17,7 @@ import numpy as np
 
 from kfvo_ros.ros.end_to_end import NodeRun, run_node
 from kfvo_ros.utils.commands import make_parser, run_command
+from kfvo_ros.utils.progress import progress
 
 COMMAND = 'benchmarks/node.py'
 RATE_HZ, RENDERED_HZ = 20.0, 30.0
@@ -54,14 +55,12 @@ def _compare(bag: Path, count: int) -> None:
 
 def _record(bag: Path, count: int) -> str:
     """Record `count` rendered frames; return the topic of the images."""
-    from tqdm import tqdm
-
     from kfvo_ros.sequences.bag.recorder import Recorder
     from kfvo_ros.sequences.bag.writer import BagWriter
     from kfvo_ros.sequences.synthetic.sequence import SyntheticSequence
     sequence = SyntheticSequence(SEED, 'smooth', count, WIDTH, HEIGHT)
     recorder = Recorder(sequence, BagWriter(bag))
-    for frame in tqdm(sequence, total=count, unit='frame', desc='rendering'):
+    for frame in progress(sequence, 'frame', 'rendering', count):
         recorder.write(frame)
     recorder.finish(complete=True)
     return sequence.topic

@@ -31,7 +31,9 @@ from kfvo_ros.training.ppo import make_model
 from kfvo_ros.training.sampler import EnvironmentConfig, make_environment
 from kfvo_ros.utils.commands import expand_ranges, make_parser, parse_numbers, run_command
 from kfvo_ros.utils.config import add_arguments, from_arguments, option
+from kfvo_ros.utils.files import user_path
 from kfvo_ros.utils.process import single_threaded
+from kfvo_ros.utils.progress import progress
 
 COMMAND = 'benchmarks/training.py'
 SEQUENCES = ('synthetic:2', 'synthetic:4', 'synthetic:6', 'synthetic:8')
@@ -98,7 +100,7 @@ def _run(argv: list[str]) -> None:
     counts, (load, *_) = parse_numbers(options.workers, 'workers', 1), os.getloadavg()
     with single_threaded(), tempfile.TemporaryDirectory() as folder:
         config, recipe = _prepare(expand_ranges(arguments.sequence), options,
-                                  Path(options.cache or folder).expanduser())
+                                  user_path(options.cache or folder))
         frames = count_frames_per_decision(config)
         results = [measure(config, recipe, workers, options.seconds) for workers in counts]
     print(f'{os.cpu_count()} cores (load {load:.1f} before), {recipe.environments} environments '
@@ -112,7 +114,6 @@ def _prepare(sequences: tuple[str, ...], options: TrainingBenchmarkOptions,
 
     There is one variant of each sequence.
     """
-    from tqdm import tqdm
     recipe = read_training_config(options.recipe)
     recipe = replace(recipe, variants=1, augmentation=replace(recipe.augmentation, max_stride=1))
     odometry = OdometryOptions(scale_rule=recipe.scale)
@@ -122,7 +123,7 @@ def _prepare(sequences: tuple[str, ...], options: TrainingBenchmarkOptions,
     # All sequences are for training: the plan may hold some out for validation.
     config = replace(setup.environment_config(plan), sequences=sequences)
     sequence_cache = config.sequence_cache(config.make_backbone())
-    for text in tqdm(sequences, unit='sequence', desc='tracking'):
+    for text in progress(sequences, 'sequence', 'tracking'):
         sequence_cache.variant(text, config.augmentation, 0)
     return config, recipe
 

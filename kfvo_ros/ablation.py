@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import sys
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from kfvo_ros import train
@@ -25,6 +24,8 @@ from kfvo_ros.utils.commands import (
     run_command,
 )
 from kfvo_ros.utils.config import add_arguments, from_arguments, option
+from kfvo_ros.utils.files import locked, user_path
+from kfvo_ros.utils.signals import raise_if_interrupted
 
 if TYPE_CHECKING:
     from kfvo_ros.training.ablation import TrainingRun
@@ -76,12 +77,12 @@ def _ablate(argv: list[str]) -> None:
     from kfvo_ros.training.ablation import PolicyTest, TrainingRun, make_setup, read_ablation_rows
     from kfvo_ros.training.ablation_report import AblationReport
     from kfvo_ros.utils.process import single_threaded
-    folder = Path(arguments.output).expanduser()
+    folder = user_path(arguments.output)
     options = replace(options, cache=options.cache or str(folder / CACHE))
-    setup = make_setup(options.recipe, options.stop, Path(options.cache or '').expanduser())
+    setup = make_setup(options.recipe, options.stop, user_path(options.cache or ''))
     recipes = read_ablation_rows(setup.recipe, options.steps)
     rows = tuple(recipes) if options.rows is None else parse_names(options.rows, 'rows', recipes)
-    with single_threaded():
+    with single_threaded(), locked(folder):
         backbone = factory.make_backbone(setup.odometry)
         plans = {row: replace(setup, recipe=recipes[row]).plan(split.training, split.validation,
                                                                backbone) for row in rows}
@@ -113,6 +114,7 @@ def _train(run: TrainingRun, split: SequenceSplit, options: AblationOptions) -> 
         argv.append('--resume')
     run.write_recipe()
     if train.main(argv) != 0:
+        raise_if_interrupted('--resume goes on from there')
         raise KfvoError(f'{run.row}, seed {run.seed}: not trained to the end, for the reason '
                         'above; --resume goes on from there')
 

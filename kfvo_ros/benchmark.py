@@ -16,11 +16,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from kfvo_ros import __version__
-from kfvo_ros.errors import KfvoError, reason_of
+from kfvo_ros.errors import KfvoError
 from kfvo_ros.keyframes import POLICIES
 from kfvo_ros.odometry.options import OdometryOptions, SequenceOptions, VggtOptions
 from kfvo_ros.utils.commands import make_parser, parse_names, parse_numbers, run_command
 from kfvo_ros.utils.config import add_arguments, from_arguments, option
+from kfvo_ros.utils.files import locked, user_path
+from kfvo_ros.utils.progress import progress_bar
+from kfvo_ros.utils.signals import Interrupted
 
 if TYPE_CHECKING:
     from kfvo_ros.evaluation.plan import BenchmarkPlan
@@ -67,12 +70,13 @@ def _benchmark(argv: list[str]) -> None:
     from kfvo_ros.evaluation.plan import open_benchmark_sequences
     from kfvo_ros.evaluation.records import Evaluator
     plan = _make_plan(arguments, options)
-    _prepare_folder(plan.folder, options)
-    runs = plan.runs(open_benchmark_sequences(plan.sequences, plan.sequence_options))
-    finished = [run for run in runs if options.resume and run.is_finished()]
-    evaluator = Evaluator(plan.sequence_options)
-    rows = _execute(plan, runs, finished, evaluator)
-    _report(plan, runs, rows, evaluator, with_plots=not options.no_pictures)
+    with locked(plan.folder):
+        _check_folder(plan.folder, options)
+        runs = plan.runs(open_benchmark_sequences(plan.sequences, plan.sequence_options))
+        finished = [run for run in runs if options.resume and run.is_finished()]
+        evaluator = Evaluator(plan.sequence_options)
+        rows = _execute(plan, runs, finished, evaluator)
+        _report(plan, runs, rows, evaluator, with_plots=not options.no_pictures)
 
 
 def _make_plan(arguments: argparse.Namespace, options: BenchmarkOptions) -> BenchmarkPlan:
@@ -91,21 +95,17 @@ def _make_plan(arguments: argparse.Namespace, options: BenchmarkOptions) -> Benc
         vggt=from_arguments(VggtOptions, arguments),
         sequence_options=from_arguments(SequenceOptions, arguments),
         jobs=options.jobs,
-        folder=Path(arguments.output).expanduser(),
+        folder=user_path(arguments.output),
         policy_sha256=check_policy(methods, odometry))
 
 
-def _prepare_folder(folder: Path, options: BenchmarkOptions) -> None:
-    """Create the folder; raises KfvoError where results would be lost."""
+def _check_folder(folder: Path, options: BenchmarkOptions) -> None:
+    """Raise KfvoError where results would be lost."""
     from kfvo_ros.evaluation.plan import RUNS
     existing = [name for name in (RESULTS, RUNS) if (folder / name).exists()]
     if existing and not (options.resume or options.overwrite):
         raise KfvoError(f'{folder} already holds {", ".join(existing)}; choose another --output, '
                         'or add --resume to continue or --overwrite to replace them')
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise KfvoError(f'cannot write to {folder}: {reason_of(error)}') from error
 
 
 def _execute(plan: BenchmarkPlan, runs: Sequence[Run], finished: Sequence[Run],
@@ -114,14 +114,12 @@ def _execute(plan: BenchmarkPlan, runs: Sequence[Run], finished: Sequence[Run],
 
     results.csv gets each row as its run ends.
     """
-    from tqdm import tqdm
-
     from kfvo_ros.evaluation.records import append_rows, sort_rows, write_rows
     from kfvo_ros.evaluation.runner import run_in_parallel
     path, done = plan.folder / RESULTS, {run.folder for run in finished}
     rows = [row for run in finished for row in evaluator.rows(run, None)]
     write_rows(path, rows)
-    with tqdm(total=len(runs), initial=len(finished), unit='run') as bar:
+    with progress_bar(len(runs), 'run', initial=len(finished)) as bar:
         def on_end(run: Run, problem: str | None) -> None:
             """Append the rows of a run, and print its problem."""
             new = evaluator.rows(run, problem)
@@ -134,9 +132,9 @@ def _execute(plan: BenchmarkPlan, runs: Sequence[Run], finished: Sequence[Run],
 
         try:
             run_in_parallel([run for run in runs if run.folder not in done], plan.jobs, on_end)
-        except KeyboardInterrupt as interruption:
-            raise KfvoError(f'interrupted after {bar.n} of {len(runs)} runs, which are in {path}; '
-                            '--resume continues') from interruption
+        except Interrupted:
+            raise Interrupted(f'{bar.n} of {len(runs)} runs are in {path}; --resume continues'
+                              ) from None
     rows = sort_rows(rows, tuple(dict.fromkeys(run.sequence.name for run in runs)), plan.methods)
     write_rows(path, rows)
     return rows

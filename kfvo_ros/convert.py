@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.utils.commands import make_parser, run_command
-from kfvo_ros.utils.signals import signals_collected
+from kfvo_ros.utils.progress import progress
+from kfvo_ros.utils.signals import Interrupted, interrupted, raise_if_interrupted
 
 if TYPE_CHECKING:
     from kfvo_ros.sequences.bag.recorder import Recorder
@@ -43,23 +44,27 @@ def _convert(argv: list[str]) -> None:
     from kfvo_ros.odometry.options import SequenceOptions
     from kfvo_ros.sequences.bag.writer import BagWriter
     from kfvo_ros.utils.config import from_arguments
+    from kfvo_ros.utils.files import locked
     options = from_arguments(SequenceOptions, arguments)
     writer = BagWriter(Path(os.path.abspath(arguments.bag)), arguments.zstd,
                        arguments.metadata_version)
     from kfvo_ros.odometry.factory import make_sequence
     from kfvo_ros.sequences.bag.recorder import Recorder
-    sequence = make_sequence(arguments.sequence, options)
-    recorder = Recorder(sequence, writer, arguments.topic, arguments.compressed)
-    with signals_collected() as interrupts:
-        problem = _record(sequence, recorder, options.stop, interrupts)
+    from kfvo_ros.sequences.base import choices_logged
+    with choices_logged():
+        sequence = make_sequence(arguments.sequence, options)
+        recorder = Recorder(sequence, writer, arguments.topic, arguments.compressed)
+    with locked(writer.path, beside=True):
+        problem = _record(sequence, recorder, options.stop)
         if recorder.frame_count == 0:
             writer.discard()
+            raise_if_interrupted()
             raise KfvoError(problem or f'{sequence.name} has no images')
         recorder.finish(complete=not problem and recorder.frame_count != options.stop)
     print(_describe(writer, recorder, arguments.bag))
     if problem:
-        raise KfvoError(f'{problem}; the {recorder.frame_count} images before that are in '
-                        f'{arguments.bag}')
+        kept = f'the {recorder.frame_count} images before that are in {arguments.bag}'
+        raise Interrupted(kept) if interrupted() else KfvoError(f'{problem}; {kept}')
 
 
 def _parse(argv: list[str]) -> argparse.Namespace:
@@ -82,16 +87,17 @@ def _parse(argv: list[str]) -> argparse.Namespace:
     return parser.parse_args(argv)
 
 
-def _record(sequence: Sequence, recorder: Recorder, stop: int | None,
-            interrupts: list[int]) -> str | None:
+def _record(sequence: Sequence, recorder: Recorder, stop: int | None) -> str | None:
     """Write the frames; return the reason for an early end, else None."""
-    from tqdm import tqdm
+    from kfvo_ros.sequences.base import check_complete
     total = sequence.length if stop is None else min(stop, sequence.length or stop)
     try:
-        for frame in tqdm(islice(sequence, stop), total=total, unit='image', desc=sequence.name):
-            if interrupts:
-                return 'interrupted'
+        for frame in progress(islice(sequence, stop), 'image', sequence.name, total):
             recorder.write(frame)
+        if recorder.frame_count != stop:
+            check_complete(sequence, recorder.frame_count)
+    except Interrupted:
+        return 'interrupted'
     except KfvoError as error:
         return str(error)
     return None
@@ -105,7 +111,7 @@ def _describe(writer: BagWriter, recorder: Recorder, bag: str) -> str:
     if recorder.camera is None:
         lines.append('no CameraInfo: this camera is not calibrated; give --camera')
     elif recorder.camera.readout_s > 0.0:
-        lines.append('camera_info.yaml in it has the readout time, which CameraInfo cannot hold')
+        lines.append('a metadata record has the readout time, which CameraInfo cannot hold')
     size_mb = sum(path.stat().st_size for path in writer.path.iterdir()) / 1e6
     lines.append(f'{bag}: {recorder.frame_count} images, {size_mb:.1f} MB; replay it by')
     lines += [f'  {player} {shlex.quote(bag)}'

@@ -17,7 +17,7 @@ from typing import Any
 from kfvo_ros import __version__
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.utils.commands import make_parser, run_command
-from kfvo_ros.utils.signals import signals_blocked
+from kfvo_ros.utils.signals import raise_if_interrupted
 
 SEQUENCE = 'synthetic:8:smooth'
 BAG, TRAJECTORY, SUMMARY, PLOT = 'bag', 'trajectory.tum', 'summary.json', 'trajectory.png'
@@ -41,9 +41,10 @@ def _run(argv: list[str]) -> None:
 def _run_demo(text: str, folder: Path) -> dict[str, Any]:
     """Convert, play, listen and evaluate; return the summary."""
     # Heavy imports after the check of the arguments: --help answers at once.
-    with signals_blocked():
-        from kfvo_ros.ros.end_to_end import run_node
     from kfvo_ros import convert
+    from kfvo_ros.odometry.factory import make_backbone
+    from kfvo_ros.odometry.options import OdometryOptions
+    from kfvo_ros.ros.end_to_end import run_node
     from kfvo_ros.sequences import open_sequence
     sequence = open_sequence(text)
     truth = sequence.ground_truth()
@@ -52,8 +53,10 @@ def _run_demo(text: str, folder: Path) -> dict[str, Any]:
     shutil.rmtree(folder / BAG, ignore_errors=True)
     for name in (TRAJECTORY, SUMMARY, PLOT):
         (folder / name).unlink(missing_ok=True)
+    make_backbone(OdometryOptions())  # compiled at the first start: the node finds it in the cache
     print(f'1. {text} to {folder / BAG}', flush=True)
     if convert.main([text, str(folder / BAG)]) != 0:
+        raise_if_interrupted()
         raise KfvoError('the sequence could not be converted')
     print('2. kfvo_node and kfvo_play, over DDS', flush=True)
     run = run_node(folder / BAG, sequence.topic, {

@@ -5,10 +5,9 @@
 from __future__ import annotations
 
 import sys
-import time
 
 from kfvo_ros.utils.commands import make_parser, run_command
-from kfvo_ros.utils.signals import Interrupted, ignore_signals, signals_blocked
+from kfvo_ros.utils.signals import Interrupted, sleep
 
 EXAMPLES = """examples:
   kfvo_node --ros-args -r image:=/camera/image_raw
@@ -22,19 +21,17 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _run(argv: list[str]) -> None:
-    with signals_blocked():
-        from kfvo_ros.ros.node import KfvoNode
-        from kfvo_ros.ros.runtime import remove_ros_arguments, spinning_node
-        from kfvo_ros.utils.process import single_threaded
+    from kfvo_ros.ros.node import KfvoNode
+    from kfvo_ros.ros.runtime import remove_ros_arguments, spinning_node
+    from kfvo_ros.utils.process import single_threaded
     _parse(remove_ros_arguments(argv))
     with single_threaded(), spinning_node(KfvoNode, argv) as node:
         try:
             while node.context.ok():
-                time.sleep(0.5)
+                sleep(0.5)
         except Interrupted:
             pass
         finally:
-            ignore_signals()
             node.close()
 
 

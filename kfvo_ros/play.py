@@ -12,7 +12,7 @@ from typing import Any
 
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.utils.commands import make_parser, run_command
-from kfvo_ros.utils.signals import Interrupted, ignore_signals, signals_blocked
+from kfvo_ros.utils.signals import Interrupted
 
 EXAMPLES = """examples:
   python -m kfvo_ros.play MH_01_easy.bag --wait-for-subscribers
@@ -33,14 +33,13 @@ def main(argv: list[str] | None = None) -> int:
 
 def _run(argv: list[str]) -> None:
     # Heavy imports after the check of the arguments: --help answers at once.
-    with signals_blocked():
-        from kfvo_ros.ros.options import PlayOptions
-        from kfvo_ros.utils.config import from_arguments
-        arguments = _parse(argv)
-        options = from_arguments(PlayOptions, arguments)
-        from kfvo_ros.ros.player import Player, make_node
-        from kfvo_ros.ros.runtime import spinning_node
-        from kfvo_ros.sequences.bag.reader import Bag
+    from kfvo_ros.ros.options import PlayOptions
+    from kfvo_ros.utils.config import from_arguments
+    arguments = _parse(argv)
+    options = from_arguments(PlayOptions, arguments)
+    from kfvo_ros.ros.player import Player, make_node
+    from kfvo_ros.ros.runtime import spinning_node
+    from kfvo_ros.sequences.bag.reader import Bag
     with Bag(Path(arguments.bag)) as bag:
         topics = _choose_topics(bag, options.topic)
         with spinning_node(make_node, argv) as node:
@@ -50,8 +49,6 @@ def _run(argv: list[str]) -> None:
                 ending = ''
             except Interrupted:
                 ending = f', interrupted at {player.position_s:.1f} s'
-            finally:
-                ignore_signals()
     print(f'{player.published} messages published{ending}')
 
 
@@ -73,7 +70,8 @@ def _choose_topics(bag: Any, wanted: tuple[str, ...]) -> list[str]:
         return [_find_topic(bag, topic) for topic in dict.fromkeys(wanted)]
     if not bag.topics:
         raise KfvoError(f'{bag.path} holds no messages')
-    images = bag.image_topics()
+    from kfvo_ros.sequences.bag.topics import rank_image_topics
+    images = [topic for topics in rank_image_topics(bag) for topic in topics]
     if images[1:]:
         _log.info('of the image topics only %s is played; --topic plays others: %s', images[0],
                   ', '.join(images[1:]))

@@ -13,7 +13,8 @@ from typing import Any
 from kfvo_ros import __version__
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.utils.commands import make_parser, run_command
-from kfvo_ros.utils.signals import signals_collected
+from kfvo_ros.utils.progress import progress
+from kfvo_ros.utils.signals import Interrupted, interrupted, raise_if_interrupted
 
 EXAMPLES = """examples:
   python -m kfvo_ros.run synthetic:7 --output out
@@ -32,28 +33,39 @@ def _run(argv: list[str]) -> None:
     from kfvo_ros.odometry.options import OdometryOptions, SequenceOptions, VggtOptions
     from kfvo_ros.utils.config import from_arguments
     arguments = _parse(argv)
-    from kfvo_ros.evaluation.results import ResultWriter
+    from kfvo_ros.evaluation.results import ResultWriter, WarningList
     from kfvo_ros.odometry import factory
+    from kfvo_ros.sequences.base import choices_logged, read_ground_truth
+    from kfvo_ros.utils.files import locked
     from kfvo_ros.utils.process import single_threaded
     odometry_options = from_arguments(OdometryOptions, arguments)
     sequence_options = from_arguments(SequenceOptions, arguments)
-    with single_threaded():
-        sequence = factory.make_sequence(arguments.sequence, sequence_options)
+    folder = Path(arguments.output)
+    with single_threaded(), WarningList() as warnings, locked(folder):
+        with choices_logged():
+            sequence = factory.make_sequence(arguments.sequence, sequence_options)
+            truth, truth_problem = read_ground_truth(sequence)
         odometry = factory.make_odometry(odometry_options, factory.make_backbone(
             odometry_options, from_arguments(VggtOptions, arguments)))
-        truth = sequence.ground_truth()
-        writer = ResultWriter(Path(arguments.output), arguments.overwrite)
+        raise_if_interrupted()
+        writer = ResultWriter(folder, arguments.overwrite)
         problem = _process(sequence, odometry, writer, sequence_options.stop)
         about = {'sequence': sequence.name, 'backbone': odometry.backbone.name,
                  'keyframe_policy': odometry.policy.name, 'scale_rule': odometry.scale.rule,
                  'seed': odometry_options.seed, 'version': __version__,
-                 **odometry.backbone.device_info()}
-        with signals_collected():  # a second Ctrl-C must not lose the summary
-            writer.append(odometry.finish())
-            summary = writer.finish(about | ({'ended_early': problem} if problem else {}), truth)
+                 **odometry.backbone.device_info(), **sequence.sources}
+        if truth_problem is not None:
+            about['ground_truth_problem'] = truth_problem
+        if sequence.left_out:
+            about['left_out'] = sequence.left_out
+        if warnings.texts:
+            about['warnings'] = warnings.texts
+        writer.append(odometry.finish())
+        summary = writer.finish(about | ({'ended_early': problem} if problem else {}), truth)
     print(_describe(summary, writer.folder))
     if problem:
-        raise KfvoError(f'{problem}; the results so far are in {writer.folder}')
+        kept = f'the results so far are in {writer.folder}'
+        raise Interrupted(kept) if interrupted() else KfvoError(f'{problem}; {kept}')
 
 
 def _parse(argv: list[str]) -> argparse.Namespace:
@@ -73,15 +85,19 @@ def _parse(argv: list[str]) -> argparse.Namespace:
 
 def _process(sequence: Any, odometry: Any, writer: Any, stop: int | None) -> str | None:
     """Process the frames; return why it ended early, None if it did not."""
-    from tqdm import tqdm
+    from kfvo_ros.sequences.base import check_complete
     total = sequence.length if stop is None else min(stop, sequence.length or stop)
+    count = 0
     try:
-        for frame in tqdm(islice(sequence, stop), total=total, unit='frame', desc=sequence.name):
+        for frame in progress(islice(sequence, stop), 'frame', sequence.name, total):
             writer.update(odometry.process(frame))
-    except KeyboardInterrupt:
+            count += 1
+    except Interrupted:
         return 'interrupted'
     except KfvoError as error:
         return str(error)
+    if stop is None or count < stop:
+        check_complete(sequence, count)
     return None
 
 

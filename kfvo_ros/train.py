@@ -10,13 +10,14 @@ import shlex
 import sys
 from contextlib import closing
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from kfvo_ros import __version__
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.utils.commands import make_parser, run_command
-from kfvo_ros.utils.signals import Interrupted, signals_collected
+from kfvo_ros.utils.files import locked, user_path
+from kfvo_ros.utils.progress import progress, progress_bar
+from kfvo_ros.utils.signals import Interrupted, interrupted, raise_if_interrupted
 
 if TYPE_CHECKING:
     from kfvo_ros.backbones.base import Backbone
@@ -49,7 +50,7 @@ def _train(argv: list[str]) -> None:
     import tensorboard  # noqa: F401  torch's writer would not name the missing package
 
     from kfvo_ros.odometry import factory
-    from kfvo_ros.training.checkpoint import read_checkpoint
+    from kfvo_ros.training.checkpoint import is_finished, read_checkpoint
     from kfvo_ros.training.plan import TrainingFiles
     from kfvo_ros.training.ppo import Trainer
     from kfvo_ros.training.sampler import make_environment
@@ -62,16 +63,21 @@ def _train(argv: list[str]) -> None:
     with single_threaded():
         backbone = factory.make_backbone(setup.odometry, setup.vggt)
         plan = setup.plan(arguments.sequence, arguments.validation, backbone)
-        checkpoint = read_checkpoint(files.checkpoint, plan) if arguments.resume else None
-        # The environment first: it refuses sequences before a long validation.
-        with closing(make_environment(
-                setup.environment_config(plan), plan.recipe.environments, arguments.workers,
-                plan.seed_at(checkpoint.steps if checkpoint else 0))) as environment:
-            validation = _make_validation(plan, setup, backbone)
-            scores = _score_references(validation, plan, setup) if validation else {}
-            files.prepare(arguments.resume)
-            _learn(Trainer(plan, environment, files, validation, scores, metadata, checkpoint),
-                   files)
+        if arguments.resume and is_finished(files, plan):
+            print(f'{files.output} is complete: all {plan.recipe.steps} steps are done, nothing '
+                  'changes; go on with more --steps, or train it again with --overwrite')
+            return
+        with locked(files.folder):
+            checkpoint = read_checkpoint(files.checkpoint, plan) if arguments.resume else None
+            # The environment first: it refuses sequences before a long validation.
+            with closing(make_environment(
+                    setup.environment_config(plan), plan.recipe.environments, arguments.workers,
+                    plan.seed_at(checkpoint.steps if checkpoint else 0))) as environment:
+                validation = _make_validation(plan, setup, backbone)
+                scores = _score_references(validation, plan, setup) if validation else {}
+                files.prepare(arguments.resume)
+                _learn(Trainer(plan, environment, files, validation, scores, metadata,
+                               checkpoint), files)
 
 
 def _make_setup(arguments: argparse.Namespace) -> TrainingSetup:
@@ -93,14 +99,12 @@ def _make_setup(arguments: argparse.Namespace) -> TrainingSetup:
         odometry.seed, recipe,
         replace(odometry, scale_rule=odometry.scale_rule or recipe.scale, seed=0),
         sequence_options, from_arguments(VggtOptions, arguments),
-        Path(arguments.cache).expanduser() if arguments.cache else None)
+        user_path(arguments.cache) if arguments.cache else None)
 
 
 def _make_validation(plan: TrainingPlan, setup: TrainingSetup,
                      backbone: Backbone) -> PolicyEvaluation | None:
     """Return the evaluation that chooses the best policy, None without sequences."""
-    from tqdm import tqdm
-
     from kfvo_ros.odometry import factory
     from kfvo_ros.training.evaluation import PolicyEvaluation
     if not plan.validation:
@@ -108,7 +112,7 @@ def _make_validation(plan: TrainingPlan, setup: TrainingSetup,
               '--validation')
         return None
     sequences = setup.sequence_cache(backbone).sequences(plan.validation)
-    for _ in tqdm(sequences, unit='sequence', desc='validation'):
+    for _ in progress(sequences, 'sequence', 'validation'):
         pass  # encode and cache all of them now, and refuse what cannot be read
     return PolicyEvaluation(sequences, backbone, factory.signature_of(setup.odometry, backbone))
 
@@ -127,19 +131,17 @@ def _score_references(validation: PolicyEvaluation, plan: TrainingPlan,
 
 
 def _learn(trainer: Trainer, files: TrainingFiles) -> None:
-    """Train to the end; after an interruption or an error save first, then raise KfvoError."""
-    with signals_collected() as signals, \
-            closing(ProgressDisplay(trainer.plan.recipe.steps, trainer.steps, signals)) as display:
+    """Train to the end; after an interruption or an error save first, then raise it."""
+    with closing(ProgressDisplay(trainer.plan.recipe.steps, trainer.steps)) as display:
         try:
             trainer.learn(display)
         except (Interrupted, KfvoError) as problem:
             trainer.save()
+            kept = (f'{files.folder} holds the policy after {trainer.steps} steps '
+                    f'({files.last.name}) and the checkpoint from which --resume goes on')
             # A signal to the process group may have ended workers, which is a KfvoError.
-            reason = 'interrupted' if signals else str(problem)
-            raise KfvoError(
-                f'{reason}; {files.folder} holds the policy after {trainer.steps} steps '
-                f'({files.last.name}) and the checkpoint from which --resume goes on'
-                ) from problem
+            raise (Interrupted(kept) if interrupted() else KfvoError(f'{problem}; {kept}')
+                   ) from problem
     print(f'{files.output}: the {"best" if trainer.plan.validation else "last"} policy of '
           f'{trainer.steps} steps; checkpoint, logs and last policy are in {files.folder}')
 
@@ -147,18 +149,16 @@ def _learn(trainer: Trainer, files: TrainingFiles) -> None:
 class ProgressDisplay:
     """A `TrainingCallback` with a progress bar and a table row for each validation.
 
-    Raises Interrupted once `signals` holds one.
+    Raises Interrupted after a signal.
     """
 
-    def __init__(self, steps: int, done: int, signals: list[int]) -> None:
-        from tqdm import tqdm
-        self._bar = tqdm(total=max(steps, done), initial=done, unit='step')
-        self._signals = signals
+    def __init__(self, steps: int, done: int) -> None:
+        self._bar = progress_bar(max(steps, done), 'step', initial=done)
 
     def on_step(self, steps: int) -> None:
         """Move the bar."""
         self._bar.update(steps - self._bar.n)
-        self._raise_on_signal()
+        raise_if_interrupted()
 
     def on_rollout(self, mean_return: float, keyframe_rate: float) -> None:
         """Show return and keyframe rate beside the bar."""
@@ -167,7 +167,7 @@ class ProgressDisplay:
 
     def on_validation_sequence(self) -> None:
         """Stop here after a signal."""
-        self._raise_on_signal()
+        raise_if_interrupted()
 
     def on_validation(self, steps: int, score: Score, is_best: bool) -> None:
         """Print the row."""
@@ -177,10 +177,6 @@ class ProgressDisplay:
     def close(self) -> None:
         """Leave the bar as it is."""
         self._bar.close()
-
-    def _raise_on_signal(self) -> None:
-        if self._signals:
-            raise Interrupted
 
 
 def _format_score(name: str, score: Score) -> str:

@@ -7,12 +7,13 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
+from command_lines import leftovers
 
-from kfvo_ros.utils.process import single_threaded
-from kfvo_ros.utils.signals import SIGNALS
+from kfvo_ros.utils.process import single_threaded, time_limit
 
 OVER_DDS = ('test_demo', 'test_vggt_node')
 """Test files outside test/ros that communicate over DDS and are timed: they run in sequence."""
@@ -41,13 +42,15 @@ def interruptible() -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-@pytest.fixture(scope='module')
-def own_signals() -> Iterator[None]:
-    """Restore the signal handlers that commands set when they run in this process."""
-    handlers = {number: signal.getsignal(number) for number in SIGNALS}
+@pytest.fixture(scope='module', autouse=True)
+def no_process_left() -> Iterator[None]:
+    """Fail where the tests of a file leave processes running, and end those."""
     yield
-    for number, handler in handlers.items():
-        signal.signal(number, handler)
+    left = leftovers(time_limit(5.0))
+    for number in left:
+        with suppress(ProcessLookupError):
+            os.kill(number, signal.SIGKILL)
+    assert not left
 
 
 @pytest.fixture(scope='session')

@@ -29,8 +29,6 @@ from kfvo_ros.training.config import read_training_config
 from kfvo_ros.training.rewards import ALPHA
 from kfvo_ros.utils.files import find_config
 
-pytestmark = pytest.mark.usefixtures('own_signals')
-
 TRAINED = ('full', 'local_signals_only')
 TESTED = ('synthetic:5:smooth', 'synthetic:6:smooth')
 REFERENCES = ('every', 'optical_flow', 'survival', 'random', 'rail', 'constant_position',

@@ -9,14 +9,18 @@ import os
 import shutil
 import signal
 import subprocess
-import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import pytest
-from command_lines import ENVIRONMENT, assert_one_readable_line, run_python
+from command_lines import (
+    assert_one_readable_line,
+    children_of,
+    is_running,
+    run_python,
+    started,
+)
 from odometry_scenes import frames_of, truth_of
 from policies import ALWAYS, write_policy
 from sequence_writers import write_camera_info, write_image, write_kitti
@@ -30,8 +34,7 @@ from kfvo_ros.odometry import factory
 from kfvo_ros.odometry.options import OdometryOptions
 from kfvo_ros.sequences import open_sequence
 from kfvo_ros.trajectory import read_tum
-
-pytestmark = pytest.mark.usefixtures('own_signals')
+from kfvo_ros.utils.process import time_limit
 
 COUNT = 16
 METHODS = ('every', 'learned')
@@ -187,8 +190,8 @@ def test_another_policy_of_the_same_name_is_rejected(finished, sequences, policy
     (['/no/such/place'], '/no/such/place does not exist'),
     (['synthetic:0', '--methods', 'often'], "survival, parallax, learned, came 'often'"),
     (['synthetic:0', '--methods', 'every,'], "came ''"),
-    (['synthetic:0', '--seeds', '1,x'], "seeds: expected whole numbers from 0 with commas in "
-     "between, came '1,x'"),
+    (['synthetic:0', '--seeds', '1,x'], "seeds: expected whole numbers from 0 to 2147483647 "
+     "with commas in between, came '1,x'"),
     (['synthetic:0', '--methods', 'learned', '--backbone', 'vggt'], 'name one with --policy'),
     (['synthetic:0', '--policy', 'p.safetensors', '--methods', 'every'], 'not among the methods'),
     (['synthetic:0', '--policy', '/no/policy'], 'cannot read the policy /no/policy'),
@@ -230,53 +233,36 @@ def test_missing_matplotlib_is_reported_before_any_run(tmp_path):
 # Interrupted runs
 
 
-def children_of(process: subprocess.Popen[str]) -> list[int]:
-    found = []
-    for path in Path('/proc').glob('[0-9]*/stat'):
-        try:
-            _, _, fields = path.read_text().rpartition(')')
-        except OSError:  # it has just ended
-            continue
-        if int(fields.split()[1]) == process.pid and fields.split()[0] != 'Z':
-            found.append(int(path.parent.name))
-    return found
+def short_command(folder: Path, methods: str, *more: object) -> list[object]:
+    return ['-m', 'kfvo_ros.benchmark', 'synthetic:1:smooth', '--stop', 40, '--methods', methods,
+            '--no-pictures', '--output', folder, *more]
 
 
-@contextmanager
-def started(folder: Path, methods: str) -> Iterator[subprocess.Popen[str]]:
-    """Start a benchmark in a process group of its own, as terminals do."""
-    process = subprocess.Popen(
-        [sys.executable, '-m', 'kfvo_ros.benchmark', 'synthetic:1:smooth', '--stop', '40',
-         '--methods', methods, '--no-pictures', '--output', str(folder)], text=True,
-        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, env=ENVIRONMENT,
-        start_new_session=True)
-    try:
-        yield process
-    finally:
-        process.kill()
-        process.communicate()
+def running(folder: Path, methods: str) -> AbstractContextManager[subprocess.Popen[str]]:
+    """Start a benchmark in a session of its own, as terminals do."""
+    return started(*short_command(folder, methods), stdout=subprocess.DEVNULL)
 
 
 def wait_for_child(process: subprocess.Popen[str], folder: Path, method: str) -> int:
     """Wait until a method has final poses; return the id of its process."""
     path = folder / 'runs' / 'synthetic_1_smooth' / method / '0' / 'trajectory.tum'
-    deadline = time.monotonic() + 60.0
+    deadline = time.monotonic() + time_limit(60.0)
     while not (path.exists() and path.read_text().count('\n') >= 3):
         assert time.monotonic() < deadline and process.poll() is None
         time.sleep(0.01)
-    child, = children_of(process)
+    child, = children_of(process.pid)
     return child
 
 
 def test_a_killed_run_has_a_row_and_ctrl_c_keeps_the_rows(tmp_path):
-    with started(tmp_path, 'every,optical_flow,survival') as process:
+    with running(tmp_path, 'every,optical_flow,survival') as process:
         os.kill(wait_for_child(process, tmp_path, 'every'), signal.SIGKILL)
         last = wait_for_child(process, tmp_path, 'survival')
         os.killpg(process.pid, signal.SIGINT)  # a terminal sends it to the children too
-        problems = process.communicate(timeout=30.0)[1]
-    assert process.returncode == 1 and 'Traceback' not in problems
+        problems = process.communicate(timeout=time_limit(30.0))[1]
+    assert process.returncode == 128 + signal.SIGINT and 'Traceback' not in problems
     line = problems.splitlines()[-1]
-    assert 'error: interrupted after 2 of 3 runs' in line and '--resume' in line
+    assert 'error: interrupted; 2 of 3 runs are in' in line and '--resume' in line
     rows = rows_of(tmp_path)
     assert [(row['method'], row['status']) for row in rows] == [
         ('every', 'failed'), ('optical_flow', 'finished'), ('constant_position', 'finished'),
@@ -286,9 +272,33 @@ def test_a_killed_run_has_a_row_and_ctrl_c_keeps_the_rows(tmp_path):
 
 
 def test_no_process_outlives_a_terminated_benchmark(tmp_path):
-    with started(tmp_path, 'every,survival') as process:
+    with running(tmp_path, 'every,survival') as process:
         child = wait_for_child(process, tmp_path, 'every')
         process.terminate()
-        problems = process.communicate(timeout=30.0)[1]
-    assert process.returncode == 1 and 'interrupted after 0 of 2 runs' in problems
+        problems = process.communicate(timeout=time_limit(30.0))[1]
+    assert process.returncode == 128 + signal.SIGTERM
+    assert 'interrupted; 0 of 2 runs are in' in problems
     assert rows_of(tmp_path) == [] and not Path('/proc', str(child)).exists()
+
+
+def test_a_killed_benchmark_leaves_no_process_and_is_resumed_at_once(tmp_path):
+    """No second process may write to the folder of a run."""
+    runs = tmp_path / 'runs' / 'synthetic_1_smooth'
+    with running(tmp_path, 'every,survival') as process:
+        child = wait_for_child(process, tmp_path, 'survival')
+        before = (runs / 'every' / '0' / 'request.json').stat().st_mtime_ns
+        process.kill()
+        process.wait()
+        again = run_python(*short_command(tmp_path, 'every,survival', '--resume'))
+        assert not is_running(child)
+    assert again.returncode == 0, again.stderr
+    assert [(row['method'], row['status'], row['frames']) for row in rows_of(tmp_path)[:2]] == [
+        ('every', 'finished', '40'), ('survival', 'finished', '40')]
+    assert (runs / 'every' / '0' / 'request.json').stat().st_mtime_ns == before
+    alone = run_python('-m', 'kfvo_ros.run', 'synthetic:1:smooth', '--stop', 40, '--keyframes',
+                       'survival', '--output', tmp_path / 'alone')
+    assert alone.returncode == 0, alone.stderr
+    for name in ('trajectory.tum', 'keyframes.tum'):
+        assert (runs / 'survival' / '0' / name).read_bytes() == (
+            tmp_path / 'alone' / name).read_bytes()
+    assert not list(tmp_path.rglob('*.lock'))

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import signal
 from functools import partial
 from pathlib import Path
 
@@ -15,6 +14,7 @@ from recordings import assert_same_sequence, write_sequence
 
 from kfvo_ros.sequences import open_sequence
 from kfvo_ros.sequences.synthetic.sequence import SyntheticSequence
+from kfvo_ros.utils.signals import SIGNALS
 
 command = partial(run_python, '-m', 'kfvo_ros.convert')
 
@@ -62,10 +62,21 @@ def test_stamps_outside_ros_time(tmp_path):
     source = write_sequence('tum', tmp_path)
     index = Path(source, 'rgb.txt')
     lines = index.read_text().splitlines()
+    lines = lines[:-COUNT + 3] + [f'500000000{n}.0 {lines[-1].split()[1]}' for n in range(3)]
+    index.write_text('\n'.join(lines))
+    done = command(source, tmp_path / 'out')
+    assert_one_readable_line(done, '5000000000.000000000', '2038', '3 images')
+    assert len(list(open_sequence(str(tmp_path / 'out')))) == 3
+
+
+def test_one_odd_stamp_is_left_out_and_said(tmp_path):
+    source = write_sequence('tum', tmp_path)
+    index = Path(source, 'rgb.txt')
+    lines = index.read_text().splitlines()
     lines[-1] = '5000000000.0 ' + lines[-1].split()[1]
     index.write_text('\n'.join(lines))
     done = command(source, tmp_path / 'out')
-    assert_one_readable_line(done, '5000000000.000000000', '2038', f'{COUNT - 1} images')
+    assert done.returncode == 0 and 'left out 1 images' in done.stderr
     assert len(list(open_sequence(str(tmp_path / 'out')))) == COUNT - 1
 
 
@@ -89,14 +100,14 @@ def test_a_full_disk(tmp_path):
     assert_one_readable_line(done, 'cannot write', str(tmp_path / 'out'), 'incomplete')
 
 
-@pytest.mark.parametrize('sent', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize('sent', SIGNALS)
 def test_interruption_keeps_the_written_images(sent, tmp_path):
     bag = tmp_path / 'out'
     status, _, errors = run_interrupted(
         sent, lambda: bag.exists() and any(file.stat().st_size > 1 << 20
                                            for file in bag.iterdir()),
         '-m', 'kfvo_ros.convert', 'synthetic:7', bag)
-    assert status == 1 and 'Traceback' not in errors
+    assert status == 128 + sent and 'Traceback' not in errors
     copy = open_sequence(str(bag))
     assert f'interrupted; the {copy.length} images before' in errors.splitlines()[-1]
     assert 3 <= copy.length < 200

@@ -20,8 +20,9 @@ import pytest
 from command_lines import assert_one_readable_line, run_python
 
 import kfvo_ros
-from kfvo_ros.camera import read_camera_info
+from kfvo_ros.sequences.calibration import read_camera_info
 from kfvo_ros.utils.commands import ROS_MODULES, missing_dependency
+from kfvo_ros.utils.process import time_limit
 
 ROOT = Path(__file__).resolve().parent.parent
 SOURCES = sorted((ROOT / 'kfvo_ros').rglob('*.py'))
@@ -164,8 +165,8 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (source / name).mkdir(exist_ok=True)
         (source / name / 'probe').touch()
     done = subprocess.run([sys.executable, '-m', 'colcon', 'build'], cwd=folder, text=True,
-                             env={**os.environ, 'COLCON_HOME': str(folder)}, timeout=300,
-                             capture_output=True, check=False)
+                          env={**os.environ, 'COLCON_HOME': str(folder)},
+                          timeout=time_limit(300.0), capture_output=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     return folder
 
@@ -183,7 +184,7 @@ def start(workspace: Path, command: str, *arguments: str) -> subprocess.Complete
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ['PATH']])
     return subprocess.run(['sh', '-c', '. install/local_setup.sh && exec "$0" "$@"', str(script),
                            *arguments], cwd=workspace, env={**os.environ, 'PATH': path},
-                          text=True, capture_output=True, timeout=120, check=False)
+                          text=True, capture_output=True, timeout=time_limit(120.0), check=False)
 
 
 def test_declarations_agree(distribution: importlib.metadata.Distribution) -> None:

@@ -51,13 +51,15 @@ class Encoded:
     """Result of `Stream.encode` for one frame.
 
     ``descriptor`` (D,) float32 summarises the image for the keyframe policy. ``payload`` is
-    private to the backbone. ``tracks`` are set by backbones that track features.
+    private to the backbone. ``tracks`` are set by backbones that track features. A ``blind`` frame
+    shows nothing by which it could be located: it is LOST without an estimate, and no keyframe.
     """
 
     stamp_ns: int
     descriptor: np.ndarray
     payload: Any = None
     tracks: Tracks | None = None
+    blind: bool = False
 
 
 @dataclass(frozen=True)

@@ -169,7 +169,8 @@ def _latex_row(texts: Iterable[str]) -> str:
 
 def write_page(path: Path, title: str, tables: Sequence[Table], figures: Sequence[Path]) -> None:
     """Write tables and figures (PNG) into one HTML page, in place of an earlier one."""
-    with atomic_write(path) as draft, draft.open('w', encoding='utf-8') as file:
+    with atomic_write(path) as draft, draft.open('w', encoding='utf-8',
+                                                 errors='backslashreplace') as file:
         file.write(HTML_HEAD.format(title=escape(title), style=HTML_STYLE))
         for table in tables:
             file.writelines(_html_table(table))

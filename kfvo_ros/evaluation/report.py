@@ -79,7 +79,7 @@ def write_report(folder: Path, tables: Sequence[Table], figures: Sequence[Path],
         for name, text in ((MARKDOWN_PAGE, '\n'.join((head, *map(markdown, tables), *shown))),
                            (LATEX, latex(tables))):
             with atomic_write(folder / name) as draft:
-                draft.write_text(text, encoding='utf-8')
+                draft.write_text(text, encoding='utf-8', errors='backslashreplace')
         write_page(folder / HTML, TITLE, tables, figures)
     except OSError as error:
         raise KfvoError(f'cannot write to {folder}: {reason_of(error)}') from error

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -13,14 +14,42 @@ from typing import Any
 import numpy as np
 
 from kfvo_ros.backbones.base import Status
-from kfvo_ros.errors import KfvoError, reason_of
+from kfvo_ros.errors import KfvoError, printable, reason_of
 from kfvo_ros.evaluation import metrics
 from kfvo_ros.odometry.updates import FramePose, Update
 from kfvo_ros.sequences.base import GroundTruth
 from kfvo_ros.trajectory import Trajectory, format_tum_line
 from kfvo_ros.utils.process import peak_rss_mb
 
+PACKAGE = 'kfvo_ros'
+MAX_WARNINGS = 50
 TRAJECTORY, KEYFRAMES, SUMMARY = 'trajectory.tum', 'keyframes.tum', 'summary.json'
+
+
+class WarningList(logging.Handler):
+    """Collects the warnings that are logged within a ``with`` statement, for the summary.
+
+    ``texts`` holds each once, at most MAX_WARNINGS.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self.texts: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Take a warning."""
+        text = printable(record.getMessage())
+        if text not in self.texts and len(self.texts) < MAX_WARNINGS:
+            self.texts.append(text)
+
+    def __enter__(self) -> WarningList:
+        """Start collecting."""
+        logging.getLogger(PACKAGE).addHandler(self)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Stop collecting."""
+        logging.getLogger(PACKAGE).removeHandler(self)
 
 
 class ResultWriter:
@@ -142,8 +171,10 @@ def evaluate(estimate: Trajectory, truth: GroundTruth | None) -> dict[str, Any]:
         return {}
     try:
         error = metrics.absolute_trajectory_error(estimate, truth.trajectory)
-    except KfvoError as problem:
-        return {'ground_truth_frame': truth.frame, 'ground_truth_problem': str(problem)}
+        if not np.isfinite([error.rmse, error.alignment.scale, error.path_length]).all():
+            raise KfvoError('the error is not finite; expected credible poses')
+    except (KfvoError, ValueError, ArithmeticError) as problem:  # of numpy's linear algebra
+        return {'ground_truth_frame': truth.frame, 'ground_truth_problem': reason_of(problem)}
     return {'ate_rmse_m': error.rmse, 'ate_alignment': 'sim3', 'ate_scale': error.alignment.scale,
             'path_length_m': error.path_length, 'matched_frames': len(error.errors),
             'ground_truth_frame': truth.frame}

@@ -9,7 +9,6 @@ import os
 import shlex
 import signal
 import subprocess
-import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterable
@@ -19,8 +18,9 @@ from typing import TYPE_CHECKING, Any
 
 from kfvo_ros.errors import KfvoError, reason_of
 from kfvo_ros.evaluation.results import SUMMARY
+from kfvo_ros.utils.children import start_child
 from kfvo_ros.utils.files import atomic_write
-from kfvo_ros.utils.signals import Interrupted, signals_collected
+from kfvo_ros.utils.signals import POLL_S, raise_if_interrupted
 
 if TYPE_CHECKING:
     from kfvo_ros.evaluation.plan import BenchmarkSequence
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 REQUEST, LOG = 'request.json', 'log.txt'
 ERROR_PREFIX = 'kfvo_run: error: '
 REMEDY = 'resume with the same options, or choose another --output, or --overwrite'
-POLL_S = 0.02
 TERMINATE_TIMEOUT_S = 20.0
 """After SIGTERM a process writes what it has; after this time it is killed."""
 
@@ -71,10 +70,11 @@ class Run:
                 draft.write_text(json.dumps(request, indent=2) + '\n', encoding='utf-8')
             (self.folder / SUMMARY).unlink(missing_ok=True)
             with (self.folder / LOG).open('wb') as log:
-                return subprocess.Popen(
-                    [sys.executable, '-m', 'kfvo_ros.run', *self._command, '--overwrite',
-                     '--output', str(self.folder)], stdin=subprocess.DEVNULL, stdout=log,
-                    stderr=log, env=os.environ | {'TQDM_DISABLE': '1'})
+                return start_child(
+                    'kfvo_ros.run',
+                    [*self._command, '--overwrite', '--output', str(self.folder)],
+                    stdin=subprocess.DEVNULL, stdout=log, stderr=log,
+                    env=os.environ | {'TQDM_DISABLE': '1'})
         except OSError as error:
             raise KfvoError(f'cannot write to {self.folder}: {reason_of(error)}') from error
 
@@ -110,26 +110,22 @@ def run_in_parallel(runs: Iterable[Run], jobs: int,
                     on_end: Callable[[Run, str | None], None]) -> None:
     """Run `runs`, `jobs` at a time; call `on_end` with each run and its problem, None if none.
 
-    Raises Interrupted at SIGINT or SIGTERM, and what `on_end` raises, once all processes have
-    ended.
+    Raises Interrupted after a signal, and what `on_end` raises, once all processes have ended.
     """
     waiting, running = deque(runs), dict[subprocess.Popen[bytes], Run]()
-    with signals_collected() as interruptions:
-        try:
-            while waiting or running:
-                if interruptions:
-                    raise Interrupted
-                while waiting and len(running) < jobs:
-                    run = waiting.popleft()
-                    running[run.start()] = run
-                time.sleep(POLL_S)
-                for process in [each for each in running if each.poll() is not None]:
-                    if interruptions:  # Ctrl-C reached this process too: no problem of its own
-                        raise Interrupted
-                    run = running.pop(process)
-                    on_end(run, run.problem(process.returncode))
-        finally:
-            _terminate(running)
+    try:
+        while waiting or running:
+            raise_if_interrupted()
+            while waiting and len(running) < jobs:
+                run = waiting.popleft()
+                running[run.start()] = run
+            time.sleep(POLL_S)
+            for process in [each for each in running if each.poll() is not None]:
+                raise_if_interrupted()  # Ctrl-C reached this process too: no problem of its own
+                run = running.pop(process)
+                on_end(run, run.problem(process.returncode))
+    finally:
+        _terminate(running)
 
 
 def _terminate(processes: Iterable[subprocess.Popen[bytes]]) -> None:

@@ -4,13 +4,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
 from kfvo_ros import geometry
 from kfvo_ros.backbones.base import Backbone
-from kfvo_ros.camera import read_camera_info
 from kfvo_ros.errors import KfvoError
 from kfvo_ros.keyframes.base import KeyframePolicy, layout_of
 from kfvo_ros.keyframes.heuristics import (
@@ -25,6 +22,8 @@ from kfvo_ros.odometry.keyframe_odometry import KeyframeOdometry
 from kfvo_ros.odometry.options import OdometryOptions, SequenceOptions, VggtOptions
 from kfvo_ros.sequences import open_sequence
 from kfvo_ros.sequences.base import Sequence
+from kfvo_ros.sequences.calibration import read_calibration
+from kfvo_ros.utils.files import user_path
 
 
 def make_backbone(options: OdometryOptions, vggt: VggtOptions | None = None) -> Backbone:
@@ -101,7 +100,7 @@ def make_sequence(text: str, options: SequenceOptions) -> Sequence:
     """Return the sequence of a path or ``synthetic:SEED[:STYLE]``; raises KfvoError."""
     return open_sequence(
         text, kind=options.kind, image_topic=options.image_topic,
-        camera=read_camera_info(Path(options.camera)) if options.camera else None,
+        camera=read_calibration(user_path(options.camera)) if options.camera else None,
         ground_truth_topic=options.ground_truth_topic,
         ground_truth_to_camera=parse_transform(options.ground_truth_to_camera),
         rate=options.rate)

@@ -15,6 +15,7 @@ import numpy as np
 
 from kfvo_ros import geometry
 from kfvo_ros.backbones.base import (
+    LOST_VARIANCE,
     Backbone,
     Encoded,
     Estimate,
@@ -22,6 +23,7 @@ from kfvo_ros.backbones.base import (
     Stream,
     Window,
     WindowPrior,
+    lost_estimate,
 )
 from kfvo_ros.camera import Camera
 from kfvo_ros.images import to_grey
@@ -41,7 +43,8 @@ from kfvo_ros.utils.process import Stopwatch
 
 WINDOW_SIZE = 8
 MAX_LOST_FRAMES = 5
-"""After this many lost frames in a row the window restarts at the last known pose."""
+"""After this many lost frames in a row the window restarts at the last known pose, in the next
+frame that is not blind."""
 MAX_PENDING = 1000
 """Maximum of pending poses: a camera at rest adds no keyframes, so older poses become final."""
 
@@ -68,12 +71,14 @@ class KeyframeOdometry:
         self._keyframes: list[Keyframe] = []
         self._newest: Keyframe
         self._prior: WindowPrior | None = None
+        self._input: Window | None = None
         self._state = WindowState()
         self._step = Step()
         self._pending: list[FramePose] = []
         self._final: list[FramePose] = []
         self._lost_in_a_row = 0
         self._frames_seen = 0
+        self._started = False
 
     def process(self, frame: Frame) -> Update:
         """Estimate the pose of the next frame and return what it changed."""
@@ -88,7 +93,9 @@ class KeyframeOdometry:
         return self.commit(keep, clock.durations)
 
     def encode(self, frame: Frame, encoded: Encoded | None = None) -> Window | None:
-        """Encode the frame (step 1) and return its window; None for the first of a segment.
+        """Encode the frame (step 1) and return its window.
+
+        None for the first frame of a segment, and for a blind one.
 
         `encoded` is the frame's encoding where it exists already.
         """
@@ -97,16 +104,16 @@ class KeyframeOdometry:
         self._newest = Keyframe(encoded, self._track(frame, encoded), self._frames_seen,
                                 self._state.T_world_latest, np.zeros((6, 6)))
         self._frames_seen += 1
-        if self._lost_in_a_row >= MAX_LOST_FRAMES:
+        if self._lost_in_a_row >= MAX_LOST_FRAMES and not encoded.blind:
             self._clear_window()
-        if not self._keyframes:
-            return None
-        self._prior = self._state.prior_of(self._keyframes)
-        return Window(stream, tuple(frame.encoded for frame in self.window), self._prior)
+        self._input = self._make_input(stream) if self._keyframes else None
+        return None if encoded.blind else self._input
 
     def integrate(self, estimate: Estimate | None) -> Step:
         """Align, chain and observe (steps 3 to 5); `estimate` is None without a window."""
-        if estimate is None:
+        if self._newest.encoded.blind:
+            self._step = self._hold_blind()
+        elif estimate is None:
             self._step = self._start_segment()
         elif estimate.status is Status.LOST:
             self._step = self._hold(estimate)
@@ -159,16 +166,31 @@ class KeyframeOdometry:
             self._tracker = Tracker(frame.camera)
         return self._tracker.track(to_grey(frame.image))
 
+    def _make_input(self, stream: Stream) -> Window:
+        """Return the backbone's input for the present window."""
+        self._prior = self._state.prior_of(self._keyframes)
+        return Window(stream, tuple(frame.encoded for frame in self.window), self._prior)
+
     def _start_segment(self) -> Step:
         """Start a window at the newest frame: at the origin, or where tracking was lost.
 
         The motion while lost is unobserved: the last, large covariance stays.
         """
         newest = self._newest
+        if not self._started:
+            self._started = True
+            return Step()
         newest.covariance = self._step.covariance
         self._state = WindowState(newest.T_world_camera, memory=self._state.memory)
-        status = Status.OK if newest.index == 0 else Status.LOST
-        return replace(self._step, status=status, durations={}, decision=None, keep=True)
+        return replace(self._step, status=Status.LOST, durations={}, decision=None, keep=True)
+
+    def _hold_blind(self) -> Step:
+        """Keep the latest pose for a blind frame, which the backbone does not see."""
+        if self._input is not None:
+            return self._hold(lost_estimate(self._input))
+        covariance = LOST_VARIANCE * np.eye(6)
+        self._newest.covariance = covariance
+        return Step(Status.LOST, covariance, covariance, keep=False)
 
     def _hold(self, estimate: Estimate) -> Step:
         """Keep the latest pose for a lost frame, with the estimate's large covariance."""
@@ -237,17 +259,21 @@ class KeyframeOdometry:
         return FramePose(self._newest.encoded.stamp_ns, self._newest, np.eye(4), True)
 
     def _drop(self) -> FramePose:
-        """Drop the newest frame: its pose stays relative to the last keyframe."""
-        newest, last = self._newest, self._keyframes[-1]
+        """Drop the newest frame: its pose stays relative to the last keyframe.
+
+        Blind frames before the first keyframe are at the origin.
+        """
+        newest = self._newest
+        last = self._keyframes[-1] if self._keyframes else newest
         self._release(newest)
         return FramePose(newest.encoded.stamp_ns, last,
                          geometry.relative(last.T_world_camera, newest.T_world_camera), False)
 
     def _retire(self, keyframe: Keyframe) -> None:
-        """Release a keyframe that leaves the window; frames relative to it become final."""
+        """Release a keyframe that leaves the window; frames up to those on it become final."""
         self._release(keyframe)
         count = 0
-        while count < len(self._pending) and self._pending[count].keyframe is keyframe:
+        while count < len(self._pending) and self._pending[count].keyframe.index <= keyframe.index:
             count += 1
         self._final += self._pending[:count]
         del self._pending[:count]

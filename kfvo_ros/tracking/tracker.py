@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from kfvo_ros.camera import Camera
+from kfvo_ros.tracking.blindness import is_blind
 from kfvo_ros.tracking.corners import find_corners
 from kfvo_ros.tracking.klt import Matches
 from kfvo_ros.tracking.search import TrackSearch
@@ -31,7 +32,7 @@ MIN_INLIER_SHARE = 0.4
 PATCH_BIAS = 0.2
 """Drift of the narrow patch, as a share of its disagreement with the wide patch."""
 MIN_SURVIVORS = 12
-"""With fewer surviving tracks the frame is skipped as a flash, a closed shutter or a cut."""
+"""With fewer surviving tracks the frame is skipped as a flash or a cut."""
 MAX_SKIPPED = 3
 """After this number of skipped frames in a row tracking restarts."""
 
@@ -141,9 +142,15 @@ class Tracker:
     def track(self, grey: np.ndarray) -> Tracks:
         """Return the tracks of the next frame (H, W) uint8: surviving tracks, then new corners.
 
-        A frame in which nearly all tracks are lost (black, a flash) has no tracks. The next frame
-        is tracked from the one before it, until MAX_SKIPPED frames were skipped.
+        A blind frame has no tracks, nor has one in which nearly all are lost (a flash, a cut). The
+        next frame is tracked from the one before it. After MAX_SKIPPED such frames tracking
+        restarts, in the next frame that is not blind.
         """
+        if is_blind(grey):
+            self._skipped += 1
+            if self._skipped > MAX_SKIPPED:
+                self._image = None
+            return Tracks()
         image = self._equaliser.apply(grey)
         survivors = self._track_survivors(self._image, image)
         is_lost = len(survivors) < MIN_SURVIVORS <= len(self._state)

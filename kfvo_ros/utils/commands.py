@@ -5,17 +5,21 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib.metadata
+import io
 import logging
 import os
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from typing import NoReturn
 
 from kfvo_ros import __version__
-from kfvo_ros.errors import KfvoError, reason_of
-from kfvo_ros.utils.signals import raise_on_signals
+from kfvo_ros.errors import KfvoError, printable, reason_of
+from kfvo_ros.utils.config import MOST
+from kfvo_ros.utils.signals import Interrupted, exit_status, signals_handled
 
 DISTRIBUTIONS = {'cv2': 'opencv-python-headless', 'yaml': 'PyYAML', 'PIL': 'pillow'}
 """Distributions by module where the names differ."""
@@ -25,15 +29,42 @@ ROS_MODULES = frozenset(('rclpy', 'rcl_interfaces', 'rosgraph_msgs', 'sensor_msg
 """Modules of a ROS 2 installation; the extra ``ros`` installs them as wheels."""
 MAX_SEEDS = 10_000
 """Sequences in a range."""
+NUMBER = re.compile('[0-9]{1,10}')
 RANGE = re.compile(r'(synthetic):([0-9]{1,10})-([0-9]{1,10})((?::[a-z]+)?)')
 
 
 def make_parser(command: str, description: str, examples: str = '') -> argparse.ArgumentParser:
     """Return a parser with ``--version``; description and examples keep their line breaks."""
-    parser = argparse.ArgumentParser(prog=command, description=description, epilog=examples,
-                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = _Parser(prog=command, description=description, epilog=examples,
+                     formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--version', action='version', version=f'kfvo_ros {__version__}')
     return parser
+
+
+class _Parser(argparse.ArgumentParser):
+    """A parser whose errors are one printable line."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print the usage and the message; exit with status 2."""
+        super().error(printable(message))
+
+
+class _LineFormatter(logging.Formatter):
+    """Formats records as printable lines: they name what is in files and on topics."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802
+        """Return the line of a record, without its traceback."""
+        return printable(super().formatMessage(record))
+
+
+def _configure_terminal(command: str) -> None:
+    """Log warnings as lines of `command`; escape characters that a terminal cannot show."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors='backslashreplace')
+    handler = logging.StreamHandler()
+    handler.setFormatter(_LineFormatter(f'{command}: %(levelname)s: %(message)s'))
+    logging.basicConfig(handlers=[handler], level=logging.WARNING)
 
 
 def run_command(command: str, body: Callable[[list[str]], None], argv: list[str] | None,
@@ -41,19 +72,19 @@ def run_command(command: str, body: Callable[[list[str]], None], argv: list[str]
     """Call `body` with the arguments (None: those of the process); return the exit status.
 
     Errors that a user can cause end the command with one line on stderr and status 1; any other
-    exception is a bug and keeps its traceback. SIGINT and SIGTERM interrupt the command: status
-    1, or 0 for one that runs `until_stopped`.
+    exception is a bug and keeps its traceback. A signal interrupts the command where its loops
+    ask for it: status 128 plus the number of the signal, or 0 for one that runs `until_stopped`.
     """
-    logging.basicConfig(format=f'{command}: %(levelname)s: %(message)s', level=logging.WARNING)
-    raise_on_signals(even_ignored=until_stopped)
+    _configure_terminal(command)
+    status = 1
     try:
-        with _output_written():
+        with signals_handled(until_stopped, until_exit=argv is None), _output_written():
             body(sys.argv[1:] if argv is None else argv)
         return 0
-    except KeyboardInterrupt:
+    except Interrupted as interruption:
         if until_stopped:
             return 0
-        problem = 'interrupted'
+        problem, status = f'interrupted; {interruption}'.rstrip('; '), exit_status()
     except ImportError as error:
         problem = str(missing_dependency(error))
     except KfvoError as error:
@@ -62,8 +93,9 @@ def run_command(command: str, body: Callable[[list[str]], None], argv: list[str]
         problem = f'out of memory: {error}'.rstrip(': ')
     except OSError as error:
         problem = f'{error.filename or ""}: {reason_of(error)}'.lstrip(': ')
-    print(f'{command}: error: {problem}', file=sys.stderr)
-    return 1
+    with contextlib.suppress(OSError, ValueError):  # a closed or full stderr
+        print(f'{command}: error: {printable(problem)}', file=sys.stderr)
+    return status
 
 
 @contextmanager
@@ -117,11 +149,11 @@ def parse_names(text: str, what: str, known: Iterable[str]) -> tuple[str, ...]:
 
 
 def parse_numbers(text: str, what: str, least: int = 0) -> tuple[int, ...]:
-    """Return the whole numbers of ``1,2,...``; raises KfvoError for one below `least`."""
+    """Return the whole numbers of ``1,2,...``; raises KfvoError for one out of range."""
     parts = text.split(',')
-    if not all(part.isascii() and part.isdigit() and int(part) >= least for part in parts):
-        raise KfvoError(f'{what}: expected whole numbers from {least} with commas in between, '
-                        f'came {text!r}')
+    if not all(NUMBER.fullmatch(part) and least <= int(part) <= MOST[int] for part in parts):
+        raise KfvoError(f'{what}: expected whole numbers from {least} to {MOST[int]} with commas '
+                        f'in between, came {text!r}')
     return tuple(dict.fromkeys(map(int, parts)))
 
 

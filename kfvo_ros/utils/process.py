@@ -1,6 +1,6 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Process and host: threads, memory, durations of steps, name of the processor."""
+"""Process and host: threads, memory, durations of steps, speed, name of the processor."""
 
 from __future__ import annotations
 
@@ -13,12 +13,20 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 
 import cv2
 from threadpoolctl import threadpool_limits
 
+from kfvo_ros.errors import KfvoError, quoted
+
 CPUINFO = Path('/proc/cpuinfo')
+TIME_FACTOR = 'KFVO_TIME_FACTOR'
+"""Environment variable: a factor for all time limits, where the measured one does not suffice."""
+LOOPS, REFERENCE_S = 300_000, 0.010
+"""A loop in Python, and its time on a laptop of 2023 [s]."""
+LIMIT_MARGIN = 2.0
 
 
 @contextmanager
@@ -79,6 +87,32 @@ class Stopwatch:
         finally:
             elapsed = time.perf_counter() - start
             self.durations[step] = self.durations.get(step, 0.0) + elapsed
+
+
+def time_limit(seconds: float) -> float:
+    """Return the time limit [s] here and now for what takes up to `seconds` on a free machine.
+
+    It grows with the measured slowness of the processor and with the load of the machine. Raises
+    KfvoError unless KFVO_TIME_FACTOR, where set, is a positive number.
+    """
+    text = os.environ.get(TIME_FACTOR) or '1'
+    try:
+        factor = float(text)
+    except ValueError:
+        factor = math.nan
+    if not 0.0 < factor < math.inf:
+        raise KfvoError(f'{TIME_FACTOR}: expected a positive number, came {quoted(text)}')
+    load = os.getloadavg()[0] / (os.cpu_count() or 1)
+    return seconds * LIMIT_MARGIN * _slowness() * (1.0 + load) * factor
+
+
+@cache
+def _slowness() -> float:
+    """Return the processor's time for a loop over the reference, at least 1."""
+    start = time.process_time()
+    for _ in range(LOOPS):
+        pass
+    return max(1.0, (time.process_time() - start) / REFERENCE_S)
 
 
 def host_info() -> str:

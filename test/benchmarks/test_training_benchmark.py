@@ -16,8 +16,6 @@ from benchmarks import training
 from benchmarks.training import Throughput, format_table
 from kfvo_ros.utils.files import find_config
 
-pytestmark = pytest.mark.usefixtures('own_signals')
-
 
 def test_rows_are_rates_and_tracks_are_cached(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(tempfile, 'tempdir', str(tmp_path))

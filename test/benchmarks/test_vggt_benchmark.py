@@ -18,7 +18,6 @@ CPU = torch.device('cpu')
 FRAMES = 8
 
 
-@pytest.mark.usefixtures('own_signals')
 @pytest.mark.parametrize(('arguments', 'status', 'part'), [
     (['--size', '100x100'], 2, 'multiples of 14, came 100x100'),
     (['--size', '0x14'], 2, 'multiples of 14, came 0x14'),

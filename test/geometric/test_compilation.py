@@ -1,17 +1,13 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Test when kernels are compiled, and the cache of machine code."""
+"""Test when kernels are compiled."""
 
 from __future__ import annotations
 
 import json
-import shutil
-import subprocess
-import sys
 import textwrap
-from pathlib import Path
 
-from kfvo_ros.backbones.geometric import numba_utils
+from command_lines import run_python
 
 SIGNATURES_DURING_A_SEQUENCE = """
     import importlib, itertools, json, pkgutil
@@ -51,56 +47,11 @@ SIGNATURES_DURING_A_SEQUENCE = """
 """
 
 
-def run_script(script: str, folder: Path | None = None) -> str:
-    done = subprocess.run([sys.executable, '-c', textwrap.dedent(script)], cwd=folder,
-                          capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
-
-
 def test_kernels_are_compiled_for_all_calls_when_a_backbone_is_constructed():
-    imported, constructed, final, entry_points = json.loads(
-        run_script(SIGNATURES_DURING_A_SEQUENCE))
+    done = run_python('-c', textwrap.dedent(SIGNATURES_DURING_A_SEQUENCE))
+    assert done.returncode == 0, done.stderr
+    imported, constructed, final, entry_points = json.loads(done.stdout)
     assert len(imported) > len(set(entry_points)) == len(entry_points) > 10
     assert not any(imported.values()), 'an import does not compile'
     assert all(constructed[name] for name in entry_points)
     assert final == constructed, 'no frame waits for the compiler'
-
-
-CALLER = """
-from {package}.numba_utils import compiled
-from {package}.callee import scaled
-
-@compiled
-def run(x):
-    return scaled(x) + 1.0
-"""
-CALLEE = """
-from {package}.numba_utils import compiled
-
-@compiled
-def scaled(x):
-    return {factor} * x
-"""
-
-
-def test_machine_code_of_a_changed_callee_is_not_reused(tmp_path):
-    package = tmp_path / 'compiling'
-    package.mkdir()
-    shutil.copy(numba_utils.__file__, package)
-    (package / 'caller.py').write_text(CALLER.format(package=package.name))
-    results = []
-    for factor in (2.0, 3.0, 3.0):
-        (package / 'callee.py').write_text(CALLEE.format(package=package.name, factor=factor))
-        results.append(run_script('from compiling.caller import run; print(run(1.0), '
-                                  'sum(run.stats.cache_hits.values()))', tmp_path).split())
-    assert results == [['3.0', '0'], ['4.0', '0'], ['4.0', '1']]
-
-
-def test_entry_points_are_loaded_from_the_cache(tmp_path):
-    package = tmp_path / 'compiling'
-    package.mkdir()
-    shutil.copy(numba_utils.__file__, package)
-    script = ('from compiling import numba_utils as utils; utils.compile_entry_points(); '
-              'print([sum(utils.median.stats.cache_hits.values()), len(utils.median.signatures)])')
-    assert [run_script(script, tmp_path).strip() for _ in range(2)] == ['[0, 1]', '[1, 1]']

@@ -9,12 +9,14 @@ from dataclasses import FrozenInstanceError, asdict, fields
 
 import pytest
 
+from kfvo_ros.ablation import AblationOptions
+from kfvo_ros.benchmark import BenchmarkOptions
 from kfvo_ros.keyframes import POLICIES
 from kfvo_ros.odometry.options import OdometryOptions, SequenceOptions, VggtOptions
 from kfvo_ros.odometry.scale import SCALE_RULES
-from kfvo_ros.ros.options import PlayOptions
+from kfvo_ros.ros.options import NodeOptions, PlayOptions
 from kfvo_ros.training.config import TrainOptions
-from kfvo_ros.utils.config import add_arguments, from_arguments, to_arguments
+from kfvo_ros.utils.config import add_arguments, from_arguments, options_of, to_arguments
 
 OTHER = {
     OdometryOptions: OdometryOptions(scale_rule='translation', keyframes='optical_flow',
@@ -86,6 +88,21 @@ def test_invalid_values_are_errors_that_name_the_value(options, arguments, expec
     assert stopped.value.code == 2
     message = capsys.readouterr().err.splitlines()[-1]
     assert expected in message
+
+
+@pytest.mark.parametrize('options', [*OTHER, NodeOptions, PlayOptions, BenchmarkOptions,
+                                     AblationOptions])
+def test_every_number_has_a_largest_value(options):
+    for declared in options_of(options):
+        if declared.kind not in (int, float):
+            continue
+        assert declared.check(declared.most) == declared.most < 1e10
+        for text in ('1' + '0' * 30, '9' * 5000, '1e400', 'inf', 'nan'):
+            with pytest.raises(ValueError, match='^expected a .*at most .*, came .{1,500}$'):
+                declared.parse(text)
+        for value in (10 ** 30, 1 << 20_000, float('inf'), float('nan')):
+            with pytest.raises((ValueError, OverflowError)):
+                declared.check(value)
 
 
 def test_play_options():

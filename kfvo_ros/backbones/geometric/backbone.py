@@ -25,7 +25,11 @@ from kfvo_ros.backbones.geometric.keyframe_history import (
     select_history,
 )
 from kfvo_ros.backbones.geometric.numba_utils import compile_entry_points
-from kfvo_ros.backbones.geometric.observations import FrameTracks, build_track_table
+from kfvo_ros.backbones.geometric.observations import (
+    MIN_TRACKS,
+    FrameTracks,
+    build_track_table,
+)
 from kfvo_ros.backbones.geometric.rolling_shutter import RollingShutter
 from kfvo_ros.backbones.geometric.self_calibration import MIN_NEW_SHARE, IntrinsicsFilter
 from kfvo_ros.backbones.geometric.signals import SIGNAL_NAMES, compute_signals, measure_motion
@@ -39,8 +43,6 @@ from kfvo_ros.tracking.tracker import FEATURES, Tracker
 
 THUMBNAIL = (8, 6)
 """Width and height of the descriptor."""
-MIN_TRACKS = 12
-"""Least number of tracks, and of inliers, that the newest frame shares with the window."""
 
 
 class GeometricStream(Stream):
@@ -64,7 +66,8 @@ class GeometricStream(Stream):
         usable = np.isfinite(points).all(axis=1)
         frame_tracks = FrameTracks(self._count, tracks.select(usable), points[usable])
         self._count += 1
-        return Encoded(frame.stamp_ns, _thumbnail(grey), frame_tracks, tracks)
+        return Encoded(frame.stamp_ns, _thumbnail(grey), frame_tracks, tracks,
+                       frame_tracks.blind)
 
 
 class GeometricBackbone(Backbone):
@@ -103,7 +106,7 @@ def _stream_of(window: Window) -> GeometricStream:
 
 
 def _estimate(window: Window, stream: GeometricStream) -> Estimate:
-    """Return the estimate of one window, LOST where the newest frame shares too few tracks."""
+    """Return the estimate of one window, LOST where the newest frame shares < MIN_TRACKS."""
     frames: tuple[FrameTracks, ...] = tuple(encoded.payload for encoded in window.frames)
     prior = window.prior
     memory = history_of(prior)

@@ -1,52 +1,26 @@
 # Copyright 2026 The kfvo_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Numba compilation of the backbone's kernels, and compiled medians.
-
-Machine code is cached on disk. Numba looks it up by the function's name and the age of its source
-file, but the code also contains callees from other files and the layout of named tuples. Every
-compiled function therefore carries a digest of all those sources in its name, so that outdated
-machine code is never run.
-"""
+"""Compiled functions of the geometric backbone: decorators, and medians."""
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
-import numba
 import numpy as np
 from numba import boolean, float64, int64
 
-Kernel = TypeVar('Kernel', bound=Callable[..., Any])
+from kfvo_ros.utils.compiler import Compiler, Kernel
 
-_jit = numba.njit(cache=True, nogil=True, error_model='numpy', fastmath={'contract', 'reassoc'})
-"""Reassociation lets the processor vectorise sums."""
+compiled = Compiler(Path(__file__).parent, nogil=True, error_model='numpy',
+                    fastmath={'contract', 'reassoc'})
+"""Decorator for helpers of entry points, which are compiled with their callers.
+
+Reassociation lets the processor vectorise sums."""
 
 _entry_points: list[tuple[Any, tuple[Any, ...]]] = []
 """Compiled functions and the argument types to compile them for."""
-
-
-def _source_digest() -> str:
-    """Return 8 hex digits of a hash over all sources with compiled functions or named tuples."""
-    sources = [path.read_bytes() for path in sorted(Path(__file__).parent.glob('*.py'))]
-    return hashlib.sha256(b''.join(
-        source for source in sources
-        if any(mark in source for mark in (b'@compiled', b'@entry_point', b'(NamedTuple)')))
-    ).hexdigest()[:8]
-
-
-_DIGEST = _source_digest()
-
-
-def compiled(function: Kernel) -> Kernel:
-    """Compile a function of arrays, numbers and named tuples at its first call.
-
-    It is for helpers of entry points, which are compiled with their callers.
-    """
-    function.__qualname__ += f'_{_DIGEST}'
-    return _jit(function)
 
 
 def entry_point(*argument_types: Any) -> Callable[[Kernel], Kernel]:

@@ -16,6 +16,8 @@ from kfvo_ros.tracking.tracker import Tracks
 
 HALF_WEIGHT_UNCERTAINTY = 0.1
 """Uncertainty of a track with half the weight of a certain one [px]."""
+MIN_TRACKS = 12
+"""Least number of tracks, and of inliers, by which a frame is located."""
 MAX_ID = np.iinfo(np.int64).max
 """Greater than all track ids."""
 
@@ -31,6 +33,11 @@ class FrameTracks:
     index: int
     tracks: Tracks
     points: np.ndarray
+
+    @property
+    def blind(self) -> bool:
+        """Whether the tracks are too few to locate this frame, or any frame relative to it."""
+        return len(self.tracks) < MIN_TRACKS
 
 
 @dataclass(frozen=True)
