@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import subprocess
+import time
 
 import pytest
 from command_lines import is_running, leftovers, run_python, started
@@ -27,6 +28,9 @@ def test_a_failure_ends_the_process_and_its_children(parent):
         assert is_running(child)
         raise AssertionError
     assert process.returncode is not None and leftovers(time_limit(5.0)) == {}
+    end = time.monotonic() + time_limit(5.0)
+    while is_running(child) and time.monotonic() < end:  # killed, and about to end
+        time.sleep(0.02)
     assert not is_running(child)
 
 

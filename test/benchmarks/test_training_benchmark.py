@@ -52,5 +52,5 @@ def test_gains_are_relative_to_the_first_row():
 def test_workers_must_be_positive_numbers(workers, capsys):
     assert training.main([f'--workers={workers}']) == 1
     assert capsys.readouterr().err.strip() == (
-        'benchmarks/training.py: error: workers: expected whole numbers from 1 with commas in '
-        f'between, came {workers!r}')
+        'benchmarks/training.py: error: workers: expected whole numbers from 1 to 2147483647 '
+        f'with commas in between, came {workers!r}')
