@@ -15,7 +15,7 @@ import numpy as np
 from kfvo_ros.errors import KfvoError
 
 PLUMB_BOB, RATIONAL = 'plumb_bob', 'rational_polynomial'
-"""OpenCV's polynomial models; the number of coefficients tells which of them it is."""
+"""OpenCV's polynomial models; the number of coefficients decides which."""
 DISTORTION_SIZES = {'none': (0,), PLUMB_BOB: (4, 5), RATIONAL: (8, 12, 14), 'equidistant': (4,)}
 """Distortion models by ROS name, with their possible numbers of coefficients."""
 POLYNOMIAL_SIZES = (*DISTORTION_SIZES[PLUMB_BOB], *DISTORTION_SIZES[RATIONAL])

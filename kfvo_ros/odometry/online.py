@@ -262,7 +262,7 @@ class TrajectoryLog:
                 self._file.seek(self._size)
 
     def _deletion(self) -> KfvoError | None:
-        """Return the error of a file that somebody deleted while it grows."""
+        """Return the error of a file that was deleted while it grows."""
         if self.path is None or self._file is None or os.fstat(self._file.fileno()).st_nlink:
             return None
         return KfvoError(f'the trajectory {self.path} was deleted; a saved one has all poses')

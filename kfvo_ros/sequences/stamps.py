@@ -124,7 +124,7 @@ class StampFilter(Generic[Item]):
         """Take the next image; return those to process now, mostly this one.
 
         `arrival_ns` is the time of arrival (the bag time in files), None where there is none;
-        it replaces a stamp of zero, and tells a pause from a jump.
+        it replaces a stamp of zero, and distinguishes a pause from a jump.
         """
         image = _Image(stamp_ns, arrival_ns, False, item)
         if stamp_ns == 0 and arrival_ns:

@@ -54,7 +54,7 @@ END_OF_TIME = 2 ** 63 - 1
 
 
 @dataclass(frozen=True)
-class Block:
+class MessageBlock:
     """A chunk, or a run of records outside of chunks; ``channels`` None means unknown."""
 
     offset: int
@@ -69,7 +69,7 @@ class McapFile:
     """One MCAP file with the interface of rosbags' readers.
 
     ``connections`` are those of CDR channels, or of ROS 1 channels in a file without CDR;
-    ``is_ros1`` tells which; ``passed_over`` maps other topics to their encoding. A file without
+    ``is_ros1`` says which; ``passed_over`` maps other topics to their encoding. A file without
     a usable index is scanned, as far as it is whole. A damaged chunk is left out with a warning;
     ``damage`` has the first reason. Raises KfvoError for a file that is no MCAP file.
     """
@@ -130,7 +130,7 @@ class McapFile:
 
     def _clear(self) -> None:
         self.start_time, self.end_time = END_OF_TIME, 0
-        self._blocks: list[Block] = []
+        self._blocks: list[MessageBlock] = []
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
         self._counts: Counter[int] = Counter()
@@ -178,14 +178,14 @@ class McapFile:
             if record.message_count:
                 self._extend_times(record.message_start_time, record.message_end_time)
         elif isinstance(record, ChunkIndex):
-            self._blocks.append(Block(
+            self._blocks.append(MessageBlock(
                 record.chunk_start_offset, record.chunk_length, record.message_start_time,
                 record.message_end_time, frozenset(record.message_index_offsets) or None))
 
     def _scan(self, problem: str) -> None:
         """List blocks, channels and counts by reading all records, up to one that is not whole."""
         indexed: Counter[int] = Counter()  # messages of the last chunk by its message index
-        chunk: Block | None = None
+        chunk: MessageBlock | None = None
         run: list[Place] = []
         end = len(MAGIC)
         for place in self._records.places(end, self._records.size):
@@ -200,7 +200,8 @@ class McapFile:
                 run.append(place)
             elif place.opcode == Opcode.CHUNK and place.length >= 16:
                 start_ns, end_ns = struct.unpack('<QQ', self._records.read(place.content, 16))
-                chunk = Block(place.offset, place.end - place.offset, start_ns, end_ns, None)
+                chunk = MessageBlock(place.offset, place.end - place.offset, start_ns, end_ns,
+                                     None)
             elif place.opcode == Opcode.MESSAGE_INDEX and place.length >= 6:
                 channel, size = struct.unpack('<HI', self._records.read(place.content, 6))
                 indexed[channel] += size // 16
@@ -217,7 +218,7 @@ class McapFile:
             self._warn(f'{self.path}: {problem}; its whole chunks hold {self._counts.total()} '
                        f'messages, in {end} of {self._records.size} bytes')
 
-    def _add_chunk(self, chunk: Block, indexed: Counter[int]) -> None:
+    def _add_chunk(self, chunk: MessageBlock, indexed: Counter[int]) -> None:
         """Add a chunk; it is unpacked where the index after it does not say what is in it."""
         if not indexed or not indexed.keys() <= self._channels.keys():
             indexed = Counter(message.channel_id for message in self._unpack(chunk))
@@ -228,7 +229,8 @@ class McapFile:
 
     def _add_run(self, run: list[Place]) -> None:
         """Add the messages outside of chunks, and learn their channels."""
-        block = Block(run[0].offset, run[-1].end - run[0].offset, 0, 0, None, is_chunk=False)
+        block = MessageBlock(run[0].offset, run[-1].end - run[0].offset, 0, 0, None,
+                             is_chunk=False)
         messages = self._unpack(block)
         self._counts.update(message.channel_id for message in messages)
         if messages:
@@ -261,8 +263,8 @@ class McapFile:
                     self._counts[channel.id],
                     ConnectionExtRosbag2(encoding, self._parse_offers(channel)), self))
 
-    def _block_messages(self, block: Block, wanted: Collection[int], start_ns: int, stop_ns: int
-                        ) -> Iterator[tuple[int, Message | None]]:
+    def _block_messages(self, block: MessageBlock, wanted: Collection[int], start_ns: int,
+                        stop_ns: int) -> Iterator[tuple[int, Message | None]]:
         """Yield the time of a block before it is read, then its messages in time order."""
         yield block.start_ns, None
         messages = [message for message in self._unpack(block) if message.channel_id in wanted
@@ -270,7 +272,7 @@ class McapFile:
         for message in sorted(messages, key=attrgetter('log_time')):
             yield message.log_time, message
 
-    def _unpack(self, block: Block) -> list[Message]:
+    def _unpack(self, block: MessageBlock) -> list[Message]:
         """Return the messages of a block, none of a damaged one; learn its channels."""
         try:
             data = self._records.unpack_chunk(block.offset) if block.is_chunk else \
