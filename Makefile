@@ -56,7 +56,7 @@ help:
 	@echo 'make bench-node   a minute of 752x480 at 20 Hz, then at twice what the node can take'
 	@echo 'make bench-train  decisions per second of the environment, and of PPO'
 	@echo 'make bench-vggt   a step of the VGGT backbone, in full and with reuse'
-	@echo 'make faults  damaged files, signals, kills and full disks (docs/faults.md), for an hour;'
+	@echo 'make faults  damaged files, signals, kills, full disks (docs/faults.md); 20 minutes;'
 	@echo '             FAULTS="--only mcap,png --tries 50": some of them'
 	@echo 'make results  docs/results.md: all methods on KFVO_DATA, rooms and streets; POLICY=FILE: a'
 	@echo '              learned one too. It goes on where it was interrupted'

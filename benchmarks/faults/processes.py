@@ -45,7 +45,8 @@ class Session:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
                  place: TracebackType | None) -> None:
-        for number in {self.process.pid, *self.survivors()}:
+        self.process.kill()  # not by its number, which may be of another process by now
+        for number in self.survivors():
             with suppress(ProcessLookupError):
                 os.kill(number, signal.SIGKILL)
         self.process.wait()
