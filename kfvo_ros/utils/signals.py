@@ -39,9 +39,9 @@ def signals_handled(even_ignored: bool = False, until_exit: bool = False) -> Ite
     """Record signals in the block; the second of a kind ends the process at once.
 
     A signal that the process ignores from its start, as background jobs of shell scripts do
-    SIGINT, is handled only if `even_ignored`. If the process runs `until_exit` of the block, a
-    later signal is ignored: it would change the exit status of work that is complete. A nested
-    block changes nothing.
+    SIGINT, is handled only if `even_ignored`; SIGHUP, which nohup ignores, never. If the process
+    runs `until_exit` of the block, a later signal is ignored: it would change the exit status of
+    work that is complete. A nested block changes nothing.
     """
     global _is_handling
     if _is_handling:
@@ -50,7 +50,8 @@ def signals_handled(even_ignored: bool = False, until_exit: bool = False) -> Ite
     _received.clear()
     _is_handling = True
     previous = {number: signal.signal(number, _record) for number in SIGNALS
-                if even_ignored or signal.getsignal(number) != signal.SIG_IGN}
+                if signal.getsignal(number) != signal.SIG_IGN
+                or (even_ignored and number != signal.SIGHUP)}
     try:
         yield
     finally:

@@ -33,6 +33,20 @@ def test_a_signal_is_raised_where_it_is_asked_for(number):
         assert not signals.interrupted()
 
 
+@pytest.mark.parametrize('number', SIGNALS)
+def test_an_ignored_signal_is_handled_on_request_but_not_that_of_nohup(number):
+    before = signal.signal(number, signal.SIG_IGN)
+    try:
+        with signals_handled():
+            signal.raise_signal(number)
+            assert not signals.interrupted()
+        with signals_handled(even_ignored=True):
+            signal.raise_signal(number)
+            assert signals.interrupted() == (number != signal.SIGHUP)
+    finally:
+        signal.signal(number, before)
+
+
 def test_library_handlers_do_not_catch_an_interruption():
     assert not issubclass(Interrupted, (Exception, KeyboardInterrupt))
 
